@@ -1,0 +1,3 @@
+//! The `planesweep` program.
+
+fn main() {}

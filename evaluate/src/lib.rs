@@ -1,0 +1,1 @@
+//! How good a result is: depth error, DTU distances, Tanks and Temples F-score.

@@ -1,0 +1,122 @@
+//! Jobs: what a worker is handed, complete, so that nothing is left to decide when it is carried out.
+
+use std::path::PathBuf;
+
+use planesweep_fusion::FilterOptions;
+use planesweep_scene::{Camera, DepthHypotheses, Distortion, ViewId};
+
+use crate::{BlobKey, JobId};
+
+/// Raised whenever a change of the code changes the numbers of a result, so that results of older
+/// code are not taken for those of newer code.
+pub const NUMERICS_VERSION: u32 = 1;
+
+/// One unit of work.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Job {
+    /// The hash of the specification and of the ids in `needs`.
+    pub id: JobId,
+    /// What is to be done.
+    pub spec: JobSpec,
+    /// Jobs whose results this one reads; it is ready when each is done or failed for good.
+    pub needs: Vec<JobId>,
+}
+
+/// What a job does.
+#[derive(Clone, Debug, PartialEq)]
+pub enum JobSpec {
+    /// Infers the depth map of a view.
+    Infer(InferSpec),
+    /// Filters the depth map of a view against those of its neighbours and merges agreeing depths.
+    Filter(FilterSpec),
+    /// Turns the filtered depth map of a view into points.
+    Emit(EmitSpec),
+    /// Puts the points of all views together, in the order given.
+    Assemble(AssembleSpec),
+}
+
+/// Inference of one view. Needs nothing.
+#[derive(Clone, Debug, PartialEq)]
+pub struct InferSpec {
+    /// The reference image.
+    pub reference: ImageSpec,
+    /// The source images, best first; at least one.
+    pub sources: Vec<ImageSpec>,
+    /// The depth planes of the reference camera.
+    pub hypotheses: DepthHypotheses,
+    /// The weights file in the store.
+    pub weights: BlobKey,
+    /// Threads of one inference. Fixed by the plan, because libtorch does not promise the same bits
+    /// for another number.
+    pub threads: u32,
+}
+
+/// An image as the network wants it: undistorted, then resized to the working size.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ImageSpec {
+    /// The view it belongs to.
+    pub view: ViewId,
+    /// The view's name.
+    pub name: String,
+    /// Where the file lies, on hosts that can read it.
+    pub path: PathBuf,
+    /// BLAKE3 hash of the file's bytes.
+    pub hash: BlobKey,
+    /// The camera of the stored image.
+    pub camera: Camera,
+    /// What the lens adds to it.
+    pub distortion: Distortion,
+    /// Columns of the working image, before padding.
+    pub working_width: u32,
+    /// Rows of the working image, before padding.
+    pub working_height: u32,
+}
+
+/// Filtering of one view. Needs the `Infer` jobs of the view, first, and of its neighbours, in order.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FilterSpec {
+    /// The reference view.
+    pub view: ViewId,
+    /// The views it is checked against, best first.
+    pub neighbours: Vec<ViewId>,
+    /// The thresholds.
+    pub options: FilterOptions,
+}
+
+/// Points of one view. Needs the `Filter` jobs of the view, first, and of its neighbours, in order.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EmitSpec {
+    /// The reference view.
+    pub view: ViewId,
+    /// The views that may emit the same surface.
+    pub neighbours: Vec<ViewId>,
+}
+
+/// The cloud. Needs the `Emit` jobs of all views, in order.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AssembleSpec {
+    /// The views, in the order of their points in the cloud.
+    pub views: Vec<ViewId>,
+}
+
+impl JobSpec {
+    /// The name of the kind: "infer", "filter", "emit" or "assemble".
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Infer(_) => "infer",
+            Self::Filter(_) => "filter",
+            Self::Emit(_) => "emit",
+            Self::Assemble(_) => "assemble",
+        }
+    }
+
+    /// The view the job is about; `None` for the whole cloud.
+    pub fn view(&self) -> Option<ViewId> {
+        match self {
+            Self::Infer(spec) => Some(spec.reference.view),
+            Self::Filter(spec) => Some(spec.view),
+            Self::Emit(spec) => Some(spec.view),
+            Self::Assemble(_) => None,
+        }
+    }
+}

@@ -1,0 +1,1 @@
+//! The wire: the gRPC contract and its checked conversion to and from domain types.

@@ -1,0 +1,113 @@
+//! A depth map with its confidence, its colours and its own camera.
+
+use thiserror::Error;
+
+use crate::{Camera, Raster};
+
+/// Depth, confidence and colour of one view, all of one size, with the camera they belong to.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthMap {
+    /// The camera of the depth map itself, not of the photograph.
+    pub camera: Camera,
+    /// Depth (z, scene units); 0 where there is none.
+    pub depth: Raster<f32>,
+    /// Confidence in `[0, 1]`.
+    pub confidence: Raster<f32>,
+    /// Colour of the reference image at each pixel of the depth map.
+    pub color: Raster<[u8; 3]>,
+}
+
+/// Why parts do not make a depth map.
+#[derive(Debug, Error, PartialEq, Eq)]
+pub enum DepthMapError {
+    /// A raster does not have the size of the camera.
+    #[error("{part} is {got_width}x{got_height}, its camera {width}x{height}")]
+    SizeMismatch {
+        /// "depth", "confidence" or "color".
+        part: &'static str,
+        /// Columns of that part.
+        got_width: usize,
+        /// Rows of that part.
+        got_height: usize,
+        /// Columns of the camera.
+        width: usize,
+        /// Rows of the camera.
+        height: usize,
+    },
+}
+
+impl DepthMap {
+    /// Puts the parts together; values that are not finite or not positive become invalid (0), and
+    /// confidence is clamped to `[0, 1]`.
+    pub fn new(
+        camera: Camera,
+        mut depth: Raster<f32>,
+        mut confidence: Raster<f32>,
+        color: Raster<[u8; 3]>,
+    ) -> Result<Self, DepthMapError> {
+        let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
+        for (part, got_width, got_height) in [
+            ("depth", depth.width(), depth.height()),
+            ("confidence", confidence.width(), confidence.height()),
+            ("color", color.width(), color.height()),
+        ] {
+            if (got_width, got_height) != (width, height) {
+                return Err(DepthMapError::SizeMismatch { part, got_width, got_height, width, height });
+            }
+        }
+        for d in depth.values_mut() {
+            if !(d.is_finite() && *d > 0.0) {
+                *d = 0.0;
+            }
+        }
+        for c in confidence.values_mut() {
+            *c = if c.is_nan() { 0.0 } else { c.clamp(0.0, 1.0) };
+        }
+        Ok(Self { camera, depth, confidence, color })
+    }
+
+    /// Columns.
+    pub fn width(&self) -> usize {
+        self.depth.width()
+    }
+
+    /// Rows.
+    pub fn height(&self) -> usize {
+        self.depth.height()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Matrix3, Vector3};
+
+    use super::*;
+    use crate::{Intrinsics, Pose};
+
+    fn camera() -> Camera {
+        let intrinsics = Intrinsics { width: 2, height: 2, fx: 1.0, fy: 1.0, skew: 0.0, cx: 0.5, cy: 0.5 };
+        Camera { intrinsics, pose: Pose { rotation: Matrix3::identity(), translation: Vector3::zeros() } }
+    }
+
+    #[test]
+    fn what_is_no_depth_becomes_zero() {
+        let depth = Raster::new(2, 2, vec![f32::NAN, -1.0, f32::INFINITY, 2.0]).expect("2x2");
+        let confidence = Raster::new(2, 2, vec![f32::NAN, -1.0, 3.0, 0.5]).expect("2x2");
+        let map =
+            DepthMap::new(camera(), depth, confidence, Raster::filled(2, 2, [0; 3])).expect("sizes agree");
+        assert_eq!(map.depth.values(), [0.0, 0.0, 0.0, 2.0]);
+        assert_eq!(map.confidence.values(), [0.0, 0.0, 1.0, 0.5]);
+    }
+
+    #[test]
+    fn sizes_must_agree() {
+        let error = DepthMap::new(
+            camera(),
+            Raster::filled(2, 2, 1.0),
+            Raster::filled(3, 2, 1.0),
+            Raster::filled(2, 2, [0; 3]),
+        )
+        .expect_err("confidence is wider");
+        assert_eq!(error.to_string(), "confidence is 3x2, its camera 2x2");
+    }
+}

@@ -1,0 +1,30 @@
+//! The input and output of multi-view stereo: cameras, views, sparse points, images, depth maps.
+//!
+//! Every other crate speaks in these types, and their conventions hold everywhere:
+//!
+//! - A pose is world-to-camera: `x_cam = R x_world + t`, OpenCV axes (x right, y down, z forward).
+//!   The centre is `c = -R^T t`. Depth is z in the camera frame, in scene units.
+//! - Pixel centres are at integers: the top-left pixel's centre is (0, 0). Readers of formats that
+//!   put it at (0.5, 0.5) subtract 0.5 from the principal point, writers add it.
+//! - A camera carries the size of the image it belongs to. Resizing by `s` maps
+//!   `x' = s (x + 0.5) - 0.5`, see [`Intrinsics::resized`].
+//! - A feature map is a quarter of its image and centres its pixel `u` on image pixel `4u`, so its
+//!   camera is exactly `K` with the first two rows divided by four, see [`Intrinsics::quartered`].
+//! - Invalid depth is 0; confidence lies in `[0, 1]`.
+//! - Views are addressed by [`ViewId`] and by name, never by their position in a list.
+
+mod camera;
+mod depth_map;
+mod hypotheses;
+mod ids;
+mod raster;
+mod scene;
+mod working_image;
+
+pub use camera::{Camera, CameraError, Distortion, Intrinsics, Pose};
+pub use depth_map::{DepthMap, DepthMapError};
+pub use hypotheses::{DepthHypotheses, HypothesesError, Sampling};
+pub use ids::ViewId;
+pub use raster::{Raster, RasterError};
+pub use scene::{DepthRange, Scene, SourceScore, SparsePoints, View};
+pub use working_image::WorkingImage;

@@ -1,0 +1,1 @@
+//! What crosses crates: pipeline, cluster and golden tests.
