@@ -1,0 +1,72 @@
+//! Surface normals from the gradients of a depth map.
+
+use nalgebra::{Point2, Vector3};
+use planesweep_scene::{Camera, Raster};
+use rayon::prelude::*;
+
+/// Relative step of depth from one pixel to the next beyond which they lie on different surfaces. A
+/// plane seen by a network's map (a pixel is some 1/200 of the depth) at 80 degrees makes steps of 3 %.
+const MAX_RELATIVE_STEP: f32 = 0.05;
+
+/// The unit normal at each pixel of a depth map, in the world frame, towards the camera; zeros where
+/// there is no depth.
+///
+/// The surface's tangents are differences of the unprojected left and right, and upper and lower
+/// neighbour pixels, or of one and the pixel itself where the other has no depth or lies on another
+/// surface. A pixel with no such neighbour along an axis is taken to face the camera.
+pub fn normals(camera: &Camera, depth: &Raster<f32>) -> Raster<[f32; 3]> {
+    let mut normals = Raster::filled(depth.width(), depth.height(), [0.0; 3]);
+    let frame = Frame { camera, depth };
+    normals.values_mut().par_chunks_mut(depth.width().max(1)).enumerate().for_each(|(y, row)| {
+        for (x, normal) in row.iter_mut().enumerate() {
+            if depth.at(x, y) > 0.0 {
+                let world = camera.pose.rotation.transpose() * frame.normal(x, y);
+                *normal = world.map(|n| n as f32).into();
+            }
+        }
+    });
+    normals
+}
+
+/// A depth map as points of its camera's frame.
+struct Frame<'a> {
+    camera: &'a Camera,
+    depth: &'a Raster<f32>,
+}
+
+impl Frame<'_> {
+    fn point(&self, x: usize, y: usize) -> Vector3<f64> {
+        let depth = self.depth.at(x, y) as f64;
+        self.camera.intrinsics.unproject(&Point2::new(x as f64, y as f64), depth).coords
+    }
+
+    /// The normal at a pixel with a depth, in the camera frame.
+    fn normal(&self, x: usize, y: usize) -> Vector3<f64> {
+        let here = self.point(x, y);
+        let towards_camera = -here.normalize();
+        let right = self.tangent((x, y), (x.wrapping_sub(1), y), (x + 1, y));
+        let down = self.tangent((x, y), (x, y.wrapping_sub(1)), (x, y + 1));
+        let (Some(right), Some(down)) = (right, down) else { return towards_camera };
+        // Right, down and the line of sight are right-handed, so this order faces the camera.
+        let normal = down.cross(&right).try_normalize(0.0).unwrap_or(towards_camera);
+        if normal.dot(&here) > 0.0 { -normal } else { normal }
+    }
+
+    /// From the pixel before to the pixel after, as far as they continue the surface at `here`.
+    fn tangent(
+        &self,
+        here: (usize, usize),
+        before: (usize, usize),
+        after: (usize, usize),
+    ) -> Option<Vector3<f64>> {
+        let depth = self.depth.at(here.0, here.1);
+        let continues = |(x, y): (usize, usize)| {
+            self.depth
+                .get(x, y)
+                .is_some_and(|d| d > 0.0 && (d - depth).abs() < MAX_RELATIVE_STEP * depth.min(d))
+        };
+        let first = if continues(before) { before } else { here };
+        let last = if continues(after) { after } else { here };
+        (first != last).then(|| self.point(last.0, last.1) - self.point(first.0, first.1))
+    }
+}
