@@ -13,18 +13,27 @@
 //! - Invalid depth is 0; confidence lies in `[0, 1]`.
 //! - Views are addressed by [`ViewId`] and by name, never by their position in a list.
 
+#![warn(missing_docs)]
+
 mod camera;
 mod depth_map;
 mod hypotheses;
 mod ids;
+mod image;
+mod jpeg;
+mod pfm;
 mod raster;
 mod scene;
 mod working_image;
+mod write;
 
 pub use camera::{Camera, CameraError, Distortion, Intrinsics, Pose};
 pub use depth_map::{DepthMap, DepthMapError};
 pub use hypotheses::{DepthHypotheses, HypothesesError, Sampling};
 pub use ids::ViewId;
+pub use image::{ImageError, MAX_PIXELS, SizeMismatch, decode_image, fit_to_image, image_size, read_image};
+pub use pfm::{PfmError, PfmFormatError, decode_pfm, encode_pfm, read_depth_pfm, read_pfm, write_pfm};
 pub use raster::{Raster, RasterError};
 pub use scene::{DepthRange, Scene, SourceScore, SparsePoints, View};
-pub use working_image::WorkingImage;
+pub use working_image::{PrepareError, WorkingImage};
+pub use write::write_atomically;
