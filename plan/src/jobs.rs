@@ -1,0 +1,258 @@
+//! From a plan to the graph of jobs, each named by what determines its result.
+
+use std::collections::BTreeMap;
+
+use planesweep_scene::{Camera, DepthHypotheses, Distortion, Sampling, Scene, ViewId};
+use thiserror::Error;
+
+use crate::job::{AssembleSpec, EmitSpec, FilterSpec, ImageSpec, InferSpec, Job, JobSpec, NUMERICS_VERSION};
+use crate::size::working_size;
+use crate::{BlobKey, JobId, Plan};
+
+/// Why a plan does not become jobs.
+#[derive(Debug, Error, PartialEq, Eq)]
+pub enum JobsError {
+    /// The plan names a view that the scene does not have, or whose image has no hash.
+    #[error("cannot make a job of view {view}: its image was not read")]
+    UnknownView {
+        /// The view.
+        view: ViewId,
+    },
+}
+
+/// The jobs of a plan, every job after the jobs it needs: all `Infer` jobs in the order of the plan,
+/// then all `Filter`, all `Emit`, and `Assemble`.
+///
+/// `image_hashes` are the hashes of the image files' bytes; `weights` is the key of the weights.
+pub fn jobs(
+    scene: &Scene,
+    plan: &Plan,
+    image_hashes: &BTreeMap<ViewId, BlobKey>,
+    weights: BlobKey,
+) -> Result<Vec<Job>, JobsError> {
+    let image = |view: ViewId| -> Result<ImageSpec, JobsError> {
+        let unknown = JobsError::UnknownView { view };
+        let (Some(known), Some(hash)) = (scene.views.get(&view), image_hashes.get(&view)) else {
+            return Err(unknown);
+        };
+        let size = &known.camera.intrinsics;
+        let (working_width, working_height) = working_size(size.width, size.height, plan.options.max_size);
+        Ok(ImageSpec {
+            view,
+            name: known.name.clone(),
+            path: known.image.clone(),
+            hash: *hash,
+            camera: known.camera,
+            distortion: known.distortion,
+            working_width,
+            working_height,
+        })
+    };
+    let mut infer = Vec::with_capacity(plan.views.len());
+    for view in &plan.views {
+        let spec = InferSpec {
+            reference: image(view.view)?,
+            sources: view.sources.iter().map(|source| image(*source)).collect::<Result<_, _>>()?,
+            hypotheses: view.hypotheses,
+            weights,
+            threads: plan.options.threads,
+        };
+        infer.push(job(JobSpec::Infer(spec), Vec::new()));
+    }
+    let by_neighbourhood = |previous: &[Job], spec: &dyn Fn(ViewId, Vec<ViewId>) -> JobSpec| -> Vec<Job> {
+        let ids: BTreeMap<ViewId, JobId> =
+            previous.iter().filter_map(|job| Some((job.spec.view()?, job.id))).collect();
+        let of_view = plan.views.iter().map(|view| {
+            let neighbours: Vec<ViewId> =
+                view.neighbours.iter().copied().filter(|n| ids.contains_key(n)).collect();
+            let needs = std::iter::once(&view.view).chain(&neighbours).map(|view| ids[view]).collect();
+            job(spec(view.view, neighbours), needs)
+        });
+        of_view.collect()
+    };
+    let options = plan.options.filter;
+    let filter = by_neighbourhood(&infer, &|view, neighbours| {
+        JobSpec::Filter(FilterSpec { view, neighbours, options })
+    });
+    let emit = by_neighbourhood(&filter, &|view, neighbours| JobSpec::Emit(EmitSpec { view, neighbours }));
+    // The cloud is in the order of view ids, which does not change when the plan's order does.
+    let mut emitted: Vec<(ViewId, JobId)> =
+        emit.iter().filter_map(|job| Some((job.spec.view()?, job.id))).collect();
+    emitted.sort_unstable();
+    let (views, needs) = emitted.into_iter().unzip();
+    let assemble = job(JobSpec::Assemble(AssembleSpec { views }), needs);
+    Ok(infer.into_iter().chain(filter).chain(emit).chain([assemble]).collect())
+}
+
+/// Names a job by the hash of its specification, of the jobs it needs and of the code's numerics.
+/// Paths, names and ids of views do not enter: they do not change a number.
+fn job(spec: JobSpec, needs: Vec<JobId>) -> Job {
+    let mut digest = Digest(blake3::Hasher::new());
+    digest.u32(NUMERICS_VERSION);
+    digest.bytes(spec.kind().as_bytes());
+    match &spec {
+        JobSpec::Infer(infer) => {
+            digest.image(&infer.reference);
+            digest.u32(infer.sources.len() as u32);
+            for source in &infer.sources {
+                digest.image(source);
+            }
+            digest.hypotheses(&infer.hypotheses);
+            digest.bytes(&infer.weights.0);
+            digest.u32(infer.threads);
+        }
+        JobSpec::Filter(filter) => {
+            let options = filter.options;
+            digest.f64(options.min_confidence as f64);
+            digest.f64(options.max_reprojection_px as f64);
+            digest.f64(options.max_relative_depth as f64);
+            digest.u32(options.min_views);
+        }
+        JobSpec::Emit(_) | JobSpec::Assemble(_) => {}
+    }
+    digest.u32(needs.len() as u32);
+    for need in &needs {
+        digest.bytes(&need.0);
+    }
+    Job { id: JobId(*digest.0.finalize().as_bytes()), spec, needs }
+}
+
+/// Feeds values to a hash so that no two different sequences feed the same bytes.
+struct Digest(blake3::Hasher);
+
+impl Digest {
+    fn bytes(&mut self, bytes: &[u8]) {
+        self.0.update(&(bytes.len() as u64).to_le_bytes());
+        self.0.update(bytes);
+    }
+
+    fn u32(&mut self, value: u32) {
+        self.0.update(&value.to_le_bytes());
+    }
+
+    fn f64(&mut self, value: f64) {
+        self.0.update(&value.to_bits().to_le_bytes());
+    }
+
+    fn camera(&mut self, camera: &Camera) {
+        let k = &camera.intrinsics;
+        self.u32(k.width);
+        self.u32(k.height);
+        let (rotation, translation) = (&camera.pose.rotation, &camera.pose.translation);
+        let inner = [k.fx, k.fy, k.skew, k.cx, k.cy];
+        for value in inner.iter().chain(rotation.iter()).chain(translation.iter()) {
+            self.f64(*value);
+        }
+    }
+
+    fn image(&mut self, image: &ImageSpec) {
+        self.bytes(&image.hash.0);
+        self.camera(&image.camera);
+        let coefficients = match image.distortion {
+            Distortion::None => vec![],
+            Distortion::Radial { k1, k2 } => vec![k1, k2],
+            Distortion::OpenCv { k1, k2, p1, p2 } => vec![k1, k2, p1, p2],
+        };
+        self.u32(coefficients.len() as u32);
+        for coefficient in coefficients {
+            self.f64(coefficient);
+        }
+        self.u32(image.working_width);
+        self.u32(image.working_height);
+    }
+
+    fn hypotheses(&mut self, hypotheses: &DepthHypotheses) {
+        self.u32(match hypotheses.sampling() {
+            Sampling::Uniform => 0,
+            Sampling::Inverse => 1,
+        });
+        self.f64(hypotheses.min());
+        self.f64(hypotheses.max());
+        self.u32(hypotheses.count());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use nalgebra::{Point3, Vector3};
+    use planesweep_scene::{DepthRange, Intrinsics, Pose, View};
+
+    use super::*;
+    use crate::{PlanOptions, plan};
+
+    fn scene() -> Scene {
+        let intrinsics =
+            Intrinsics { width: 64, height: 48, fx: 60.0, fy: 60.0, skew: 0.0, cx: 31.5, cy: 23.5 };
+        let mut scene = Scene::default();
+        for k in 0..4_u32 {
+            let centre = Point3::new(0.3 * k as f64, 0.0, 0.0);
+            let pose = Pose::look_at(&centre, &Point3::new(0.5, 0.0, 5.0), &-Vector3::y());
+            let view = View {
+                id: ViewId(k),
+                name: format!("{k}.png"),
+                image: format!("{k}.png").into(),
+                camera: Camera { intrinsics, pose },
+                distortion: Distortion::None,
+                depth_range: Some(DepthRange { min: 4.0, max: 6.0, count: Some(16) }),
+            };
+            scene.views.insert(view.id, view);
+        }
+        scene
+    }
+
+    fn jobs_of(scene: &Scene, options: &PlanOptions, weights: &[u8]) -> Vec<Job> {
+        let hashes = scene.views.values().map(|v| (v.id, BlobKey::of(v.name.as_bytes()))).collect();
+        jobs(scene, &plan(scene, options), &hashes, BlobKey::of(weights)).expect("all views are known")
+    }
+
+    fn ids(jobs: &[Job]) -> BTreeSet<JobId> {
+        jobs.iter().map(|job| job.id).collect()
+    }
+
+    #[test]
+    fn every_need_stands_before_the_job_that_needs_it() {
+        let jobs = jobs_of(&scene(), &PlanOptions::default(), b"w");
+        assert_eq!(jobs.len(), 3 * 4 + 1);
+        let mut done = BTreeSet::new();
+        for job in &jobs {
+            assert!(job.needs.iter().all(|need| done.contains(need)), "{}", job.spec.kind());
+            assert!(done.insert(job.id), "two jobs have the same id");
+        }
+        assert_eq!(jobs[12].spec.kind(), "assemble");
+        assert_eq!(jobs[4].needs.len(), 1 + 3);
+    }
+
+    #[test]
+    fn ids_change_with_what_changes_numbers_and_with_nothing_else() {
+        let plain = jobs_of(&scene(), &PlanOptions::default(), b"w");
+        assert_eq!(ids(&plain), ids(&jobs_of(&scene(), &PlanOptions::default(), b"w")));
+
+        let mut moved = scene();
+        moved.views.values_mut().for_each(|view| view.image = "elsewhere".into());
+        assert_eq!(ids(&plain), ids(&jobs_of(&moved, &PlanOptions::default(), b"w")));
+
+        let other_weights = jobs_of(&scene(), &PlanOptions::default(), b"v");
+        assert!(ids(&plain).is_disjoint(&ids(&other_weights)));
+
+        let mut options = PlanOptions::default();
+        options.filter.min_views = 2;
+        let other_filter = jobs_of(&scene(), &options, b"w");
+        let (kept, fresh): (Vec<&Job>, Vec<&Job>) =
+            other_filter.iter().partition(|job| ids(&plain).contains(&job.id));
+        assert!(kept.iter().all(|job| job.spec.kind() == "infer") && kept.len() == 4 && fresh.len() == 9);
+
+        let mut bent = scene();
+        bent.views.get_mut(&ViewId(0)).expect("exists").distortion = Distortion::Radial { k1: 0.1, k2: 0.0 };
+        assert!(ids(&plain).is_disjoint(&ids(&jobs_of(&bent, &PlanOptions::default(), b"w"))));
+    }
+
+    #[test]
+    fn a_view_without_an_image_hash_is_named() {
+        let scene = scene();
+        let hashes = BTreeMap::from([(ViewId(0), BlobKey::of(b"0"))]);
+        let error = jobs(&scene, &plan(&scene, &PlanOptions::default()), &hashes, BlobKey::of(b"w"));
+        assert!(matches!(error, Err(JobsError::UnknownView { view }) if view != ViewId(0)));
+    }
+}
