@@ -1,1 +1,21 @@
 //! Procedural scenes with exact ground truth.
+//!
+//! A [`SynthScene`] follows from a seed: bodies with procedural textures, a sun, cameras around
+//! them. It renders images with exact depth from any camera, and samples sparse points with tracks
+//! as structure from motion would find them. [`write_demo`] lays one down on disk.
+
+#![warn(missing_docs)]
+
+mod camera_path;
+mod courtyard;
+mod demo;
+mod geometry;
+mod noise;
+mod render;
+mod scene;
+mod shade;
+mod sparse;
+mod texture;
+
+pub use demo::{DemoError, DemoOptions, write_demo};
+pub use scene::{Style, SynthScene};
