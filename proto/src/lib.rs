@@ -1,1 +1,47 @@
 //! The wire: the gRPC contract and its checked conversion to and from domain types.
+//!
+//! `proto/planesweep/v1/coordinator.proto` is the contract. [`wire`] is what the compiler makes of
+//! it; only `convert` and the server's handlers touch it. Everybody else speaks in the types of
+//! this page and in those of `plan`, which cannot hold what was not checked: finite numbers, true
+//! rotations, hashes of the right length, counts and names within [`limits`].
+//!
+//! ```no_run
+//! # async fn example(report: planesweep_proto::Report) -> Result<(), planesweep_proto::ServiceError> {
+//! let mut client = planesweep_proto::Client::connect("http://127.0.0.1:7070", None)?;
+//! let reply = client.report(&report).await?;
+//! for grant in reply.grants {
+//!     println!("{} for {:?}", grant.spec.kind(), grant.spec.view());
+//! }
+//! # Ok(())
+//! # }
+//! ```
+
+#![warn(missing_docs)]
+
+mod client;
+mod convert;
+mod error;
+pub mod limits;
+mod report;
+mod run;
+
+pub use client::{Client, TOKEN_HEADER, bearer};
+pub use convert::{WireError, decode_job, encode_job};
+pub use error::{Code, ServiceError};
+pub use report::{
+    Failure, FinishedJob, Grant, HeldJob, Input, JobAttempt, Order, Outcome, Produced, Report, ReportReply,
+    Role, Slots, Success, WorkerState,
+};
+pub use run::{JobResult, JobState, RunStatus, SubmitHeader, Submitted, WorkerStatus};
+
+/// Raised when a message changes its meaning; two sides with different numbers refuse each other.
+pub const PROTOCOL_VERSION: u32 = 1;
+
+/// The version of this build; a coordinator and its workers must be of one version.
+pub const CODE_VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// The generated messages, client and server.
+#[allow(missing_docs, clippy::all, clippy::pedantic, unused_qualifications)]
+pub mod wire {
+    tonic::include_proto!("planesweep.v1");
+}

@@ -1,0 +1,167 @@
+//! The client's side of the contract, in domain types.
+
+use std::time::Duration;
+
+use planesweep_plan::{Job, RunId};
+use prost::Message;
+use tokio_stream::StreamExt;
+use tonic::metadata::{Ascii, MetadataValue};
+use tonic::service::interceptor::InterceptedService;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Request, Status};
+
+use crate::limits::{MAX_MESSAGE_BYTES, SUBMIT_CHUNK_BYTES};
+use crate::wire::coordinator_client::CoordinatorClient;
+use crate::{Code, JobResult, Report, ReportReply, RunStatus, ServiceError, SubmitHeader, Submitted, wire};
+
+/// The metadata key that carries the token.
+pub const TOKEN_HEADER: &str = "authorization";
+
+/// How long a connection may take.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+/// How often an idle connection is probed, and how long the answer may take: a host that vanished
+/// without a word is noticed after both.
+const KEEP_ALIVE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(5));
+/// How long a report may take beyond the time that the reply may be held back.
+const REPORT_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// What is sent as [`TOKEN_HEADER`] for a token; an error when it has characters that no header
+/// can carry.
+pub fn bearer(token: &str) -> Result<MetadataValue<Ascii>, ServiceError> {
+    format!("Bearer {token}")
+        .parse()
+        .map_err(|_| ServiceError::new(Code::Invalid, "the token has characters other than printable ASCII"))
+}
+
+/// Adds the token to every call.
+#[derive(Clone)]
+pub struct WithToken(Option<MetadataValue<Ascii>>);
+
+impl tonic::service::Interceptor for WithToken {
+    fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
+        if let Some(token) = &self.0 {
+            request.metadata_mut().insert(TOKEN_HEADER, token.clone());
+        }
+        Ok(request)
+    }
+}
+
+type Stub = CoordinatorClient<InterceptedService<Channel, WithToken>>;
+
+/// A client of one coordinator; cheap to clone, clones share the connection.
+#[derive(Clone)]
+pub struct Client {
+    stub: Stub,
+}
+
+impl Client {
+    /// A client of the coordinator at `url`, such as `http://127.0.0.1:7070`. The connection is made
+    /// by the first call and again by the next call after it broke.
+    ///
+    /// Must be called within a tokio runtime.
+    pub fn connect(url: &str, token: Option<&str>) -> Result<Self, ServiceError> {
+        let token = token.map(bearer).transpose()?;
+        let endpoint = Endpoint::from_shared(url.to_owned())
+            .map_err(|e| ServiceError::new(Code::Invalid, format!("\"{url}\" is no address: {e}")))?
+            .connect_timeout(CONNECT_TIMEOUT)
+            .tcp_nodelay(true)
+            .http2_keep_alive_interval(KEEP_ALIVE.0)
+            .keep_alive_timeout(KEEP_ALIVE.1)
+            .keep_alive_while_idle(true);
+        let stub = CoordinatorClient::with_interceptor(endpoint.connect_lazy(), WithToken(token))
+            .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            .max_encoding_message_size(MAX_MESSAGE_BYTES);
+        Ok(Self { stub })
+    }
+
+    /// Reports, and learns what to do next. Dropping the future before it ends is safe: what it
+    /// would have granted is granted anew after the next report.
+    pub async fn report(&mut self, report: &Report) -> Result<ReportReply, ServiceError> {
+        let mut request = Request::new(wire::ReportRequest::from(report));
+        request.set_timeout(report.max_wait + REPORT_TIMEOUT);
+        Ok(self.stub.report(request).await?.into_inner().try_into()?)
+    }
+
+    /// Submits a plan; each job follows those that it needs.
+    pub async fn submit(&mut self, header: &SubmitHeader, jobs: Vec<Job>) -> Result<Submitted, ServiceError> {
+        let header = wire::SubmitChunk { header: Some(header.into()), jobs: Vec::new() };
+        let chunks = std::iter::once(header).chain(Chunks { jobs: jobs.into_iter() });
+        Ok(self.stub.submit(tokio_stream::iter(chunks)).await?.into_inner().try_into()?)
+    }
+
+    /// How far a run is, with the jobs that ended after `after`: 0 at first, then
+    /// [`JobResult::ended`] of the last one seen.
+    pub async fn status(&mut self, run: &RunId, after: u64) -> Result<RunStatus, ServiceError> {
+        let request = wire::StatusRequest { run: run.0.clone(), after };
+        Ok(self.stub.status(request).await?.into_inner().try_into()?)
+    }
+
+    /// Every job of a run, in the order of the plan.
+    pub async fn results(&mut self, run: &RunId) -> Result<Vec<JobResult>, ServiceError> {
+        let mut chunks = self.stub.results(wire::ResultsRequest { run: run.0.clone() }).await?.into_inner();
+        let mut results = Vec::new();
+        while let Some(chunk) = chunks.next().await {
+            for result in chunk?.results {
+                results.push(result.try_into()?);
+            }
+        }
+        Ok(results)
+    }
+
+    /// Stops a run; what is done stays.
+    pub async fn cancel(&mut self, run: &RunId) -> Result<(), ServiceError> {
+        self.stub.cancel(wire::CancelRequest { run: run.0.clone() }).await?;
+        Ok(())
+    }
+}
+
+/// Jobs in chunks of about [`SUBMIT_CHUNK_BYTES`], encoded one chunk at a time.
+struct Chunks {
+    jobs: std::vec::IntoIter<Job>,
+}
+
+impl Iterator for Chunks {
+    type Item = wire::SubmitChunk;
+
+    fn next(&mut self) -> Option<wire::SubmitChunk> {
+        let mut chunk = wire::SubmitChunk::default();
+        let mut bytes = 0;
+        while bytes < SUBMIT_CHUNK_BYTES {
+            let Some(job) = self.jobs.next() else { break };
+            let job = wire::Job::from(&job);
+            bytes += job.encoded_len();
+            chunk.jobs.push(job);
+        }
+        (!chunk.jobs.is_empty()).then_some(chunk)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use planesweep_plan::{EmitSpec, JobId, JobSpec};
+    use planesweep_scene::ViewId;
+
+    use super::*;
+
+    #[test]
+    fn chunks_hold_every_job_once_and_stay_small() {
+        let job = |k: u32| {
+            let mut id = [0; 32];
+            id[..4].copy_from_slice(&k.to_be_bytes());
+            let spec = JobSpec::Emit(EmitSpec { view: ViewId(k), neighbours: vec![ViewId(1); 500] });
+            Job { id: JobId(id), spec, needs: vec![JobId([1; 32]); 500] }
+        };
+        let jobs: Vec<Job> = (0..200).map(job).collect();
+        let chunks: Vec<_> = Chunks { jobs: jobs.clone().into_iter() }.collect();
+        assert!(chunks.len() > 1);
+        assert!(chunks.iter().all(|chunk| chunk.encoded_len() < 2 * SUBMIT_CHUNK_BYTES));
+        let back: Result<Vec<Job>, _> = chunks.into_iter().flat_map(|c| c.jobs).map(Job::try_from).collect();
+        assert_eq!(back, Ok(jobs));
+    }
+
+    #[test]
+    fn tokens_that_no_header_carries_are_refused() {
+        assert!(bearer("s3cret").is_ok());
+        assert_eq!(bearer("a\nb").map_err(|e| e.code), Err(Code::Invalid));
+    }
+}

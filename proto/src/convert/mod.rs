@@ -1,0 +1,10 @@
+//! Wire to domain and back. All foreign input is checked here, once: behind this module numbers
+//! are finite, rotations are rotations, hashes have 32 bytes and counts are within the limits.
+
+mod check;
+mod job;
+mod report;
+mod run;
+
+pub use check::WireError;
+pub use job::{decode_job, encode_job};

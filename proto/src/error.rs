@@ -1,0 +1,153 @@
+//! The short list of errors that cross the wire, and back.
+
+use std::fmt;
+
+use thiserror::Error;
+use tonic::Status;
+
+use crate::WireError;
+
+/// What kind of refusal it is. Each has one gRPC code, so it survives the wire.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Code {
+    /// The message breaks the contract.
+    Invalid,
+    /// No token, or a wrong one.
+    Unauthenticated,
+    /// The two sides are of different versions.
+    VersionMismatch,
+    /// There is no such run.
+    NotFound,
+    /// The message is over a limit.
+    TooLarge,
+    /// A newer report of the same worker was there first.
+    Superseded,
+    /// The other side cannot be reached, or is stopping.
+    Unavailable,
+    /// The ledger or the server failed.
+    Internal,
+}
+
+impl Code {
+    /// Whether the same call may succeed later.
+    pub fn is_retryable(self) -> bool {
+        matches!(self, Self::Superseded | Self::Unavailable | Self::Internal)
+    }
+}
+
+impl fmt::Display for Code {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Invalid => "invalid message",
+            Self::Unauthenticated => "unauthenticated",
+            Self::VersionMismatch => "version mismatch",
+            Self::NotFound => "not found",
+            Self::TooLarge => "message too large",
+            Self::Superseded => "superseded",
+            Self::Unavailable => "unavailable",
+            Self::Internal => "internal error",
+        })
+    }
+}
+
+/// Why a call failed.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[error("{code}: {message}")]
+pub struct ServiceError {
+    /// The kind.
+    pub code: Code,
+    /// What was attempted, on which thing.
+    pub message: String,
+}
+
+impl ServiceError {
+    /// An error of this kind.
+    pub fn new(code: Code, message: impl Into<String>) -> Self {
+        Self { code, message: message.into() }
+    }
+
+    /// Whether the same call may succeed later.
+    pub fn is_retryable(&self) -> bool {
+        self.code.is_retryable()
+    }
+}
+
+impl From<WireError> for ServiceError {
+    fn from(error: WireError) -> Self {
+        let code = if matches!(error, WireError::TooMany { .. } | WireError::TooLong { .. }) {
+            Code::TooLarge
+        } else {
+            Code::Invalid
+        };
+        Self::new(code, error.to_string())
+    }
+}
+
+impl From<ServiceError> for Status {
+    fn from(error: ServiceError) -> Self {
+        let code = match error.code {
+            Code::Invalid => tonic::Code::InvalidArgument,
+            Code::Unauthenticated => tonic::Code::Unauthenticated,
+            Code::VersionMismatch => tonic::Code::FailedPrecondition,
+            Code::NotFound => tonic::Code::NotFound,
+            Code::TooLarge => tonic::Code::ResourceExhausted,
+            Code::Superseded => tonic::Code::Aborted,
+            Code::Unavailable => tonic::Code::Unavailable,
+            Code::Internal => tonic::Code::Internal,
+        };
+        Self::new(code, error.message)
+    }
+}
+
+impl From<Status> for ServiceError {
+    fn from(status: Status) -> Self {
+        let code = match status.code() {
+            tonic::Code::InvalidArgument | tonic::Code::OutOfRange | tonic::Code::Unimplemented => {
+                Code::Invalid
+            }
+            tonic::Code::Unauthenticated | tonic::Code::PermissionDenied => Code::Unauthenticated,
+            tonic::Code::FailedPrecondition => Code::VersionMismatch,
+            tonic::Code::NotFound => Code::NotFound,
+            tonic::Code::ResourceExhausted => Code::TooLarge,
+            tonic::Code::Aborted => Code::Superseded,
+            // Time-outs, broken connections and servers that go away come in all of these.
+            tonic::Code::Unavailable
+            | tonic::Code::DeadlineExceeded
+            | tonic::Code::Cancelled
+            | tonic::Code::Unknown => Code::Unavailable,
+            _ => Code::Internal,
+        };
+        Self::new(code, status.message())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn codes_survive_the_wire() {
+        for code in [
+            Code::Invalid,
+            Code::Unauthenticated,
+            Code::VersionMismatch,
+            Code::NotFound,
+            Code::TooLarge,
+            Code::Superseded,
+            Code::Unavailable,
+            Code::Internal,
+        ] {
+            let error = ServiceError::new(code, "said so");
+            let back = ServiceError::from(Status::from(error.clone()));
+            assert_eq!((back.is_retryable(), &back), (error.is_retryable(), &error));
+        }
+    }
+
+    #[test]
+    fn limits_and_nonsense_differ() {
+        let large = ServiceError::from(WireError::TooMany { field: "needs", got: 9, limit: 8 });
+        assert_eq!((large.code, large.is_retryable()), (Code::TooLarge, false));
+        let nonsense = ServiceError::from(WireError::Missing { field: "spec" });
+        assert_eq!(nonsense.code, Code::Invalid);
+    }
+}
