@@ -23,6 +23,7 @@ mod image;
 mod jpeg;
 mod pfm;
 mod raster;
+mod read;
 mod scene;
 mod working_image;
 mod write;
@@ -34,6 +35,12 @@ pub use ids::ViewId;
 pub use image::{ImageError, MAX_PIXELS, SizeMismatch, decode_image, fit_to_image, image_size, read_image};
 pub use pfm::{PfmError, PfmFormatError, decode_pfm, encode_pfm, read_depth_pfm, read_pfm, write_pfm};
 pub use raster::{Raster, RasterError};
+pub use read::{
+    DepthLine, NameError, PixelCentre, ReadError, ReadOptions, ResolveError, ViewError, read_scene,
+    resolve_inside, safe_name,
+};
 pub use scene::{DepthRange, Scene, SourceScore, SparsePoints, View};
 pub use working_image::{PrepareError, WorkingImage};
-pub use write::write_atomically;
+pub use write::{
+    WriteError, mvsnet_cam_text, mvsnet_pair_text, write_atomically, write_colmap, write_mvsnet,
+};

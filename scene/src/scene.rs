@@ -19,6 +19,8 @@ pub struct Scene {
     pub pairs: BTreeMap<ViewId, Vec<SourceScore>>,
     /// What was odd about the files but had a clear meaning, in the order of reading.
     pub warnings: Vec<String>,
+    /// Views that were left out, by name, each with the reason.
+    pub skipped: BTreeMap<String, String>,
 }
 
 /// One photograph with its camera.

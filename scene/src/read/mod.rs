@@ -1,0 +1,212 @@
+//! Readers of the field's formats, all into a [`Scene`].
+
+mod colmap;
+mod colmap_binary;
+mod colmap_text;
+mod mvsnet;
+mod names;
+mod pairs;
+mod views;
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use thiserror::Error;
+
+pub use names::{NameError, ResolveError, resolve_inside, safe_name};
+
+use crate::{CameraError, Scene, SizeMismatch};
+
+/// What a reader cannot know from the files.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ReadOptions {
+    /// Leave out views with an impossible camera, name or size, with a warning, instead of refusing
+    /// the scene.
+    pub skip_bad_views: bool,
+    /// What the two numbers of a short depth line in a cam.txt mean.
+    pub depth_line: DepthLine,
+    /// Where the principal point of a cam.txt counts from. COLMAP models always count from corners.
+    pub pixel_centre: PixelCentre,
+    /// Depth planes where a cam.txt states none; 192 when not given.
+    pub plane_count: Option<u32>,
+    /// Factor on the depth interval of a cam.txt; when not given, 1.06 where the file states no
+    /// number of planes (as the DTU files need) and 1 where it does.
+    pub interval_scale: Option<f64>,
+}
+
+impl Default for ReadOptions {
+    fn default() -> Self {
+        Self {
+            skip_bad_views: false,
+            depth_line: DepthLine::Auto,
+            pixel_centre: PixelCentre::Integer,
+            plane_count: None,
+            interval_scale: None,
+        }
+    }
+}
+
+/// The meaning of a depth line of two numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DepthLine {
+    /// Minimum and maximum when the second is larger, else minimum and interval.
+    Auto,
+    /// Minimum and interval.
+    Interval,
+    /// Minimum and maximum.
+    MinMax,
+}
+
+/// The coordinates of the top-left pixel's centre.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PixelCentre {
+    /// (0, 0).
+    Integer,
+    /// (0.5, 0.5), as in folders made from COLMAP models by the common script.
+    Half,
+}
+
+/// Why a scene could not be read.
+#[derive(Debug, Error)]
+pub enum ReadError {
+    /// The folder has no layout that is known.
+    #[error(
+        "found no scene in {}: a COLMAP scene has images/ and a model in sparse/ or sparse/0/, an MVSNet folder cams/ and images/ or blended_images/",
+        path.display()
+    )]
+    NoScene {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// There is a model, but no folder with its photographs.
+    #[error("found {}, but no folder {}", model.display(), images.display())]
+    NoImages {
+        /// The model or the folder of cameras.
+        model: PathBuf,
+        /// Where images were expected.
+        images: PathBuf,
+    },
+    /// A file or folder could not be read.
+    #[error("could not read {}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        #[source]
+        source: io::Error,
+    },
+    /// A binary file is truncated or contradicts itself.
+    #[error("could not parse {} at byte {offset}: {what}", path.display())]
+    Binary {
+        /// The file.
+        path: PathBuf,
+        /// Where.
+        offset: usize,
+        /// What is wrong there.
+        what: String,
+    },
+    /// A text file breaks its format.
+    #[error("could not parse {} at line {line}: {what}", path.display())]
+    Text {
+        /// The file.
+        path: PathBuf,
+        /// Where, from 1.
+        line: usize,
+        /// What is wrong there.
+        what: String,
+    },
+    /// A file contradicts itself or the others.
+    #[error("could not use {}: it has {what}", path.display())]
+    Inconsistent {
+        /// The file.
+        path: PathBuf,
+        /// The contradiction.
+        what: String,
+    },
+    /// A view cannot be used.
+    #[error("could not take view {view:?} (leave such views out with --skip-bad-views)")]
+    View {
+        /// The view's name.
+        view: String,
+        /// What is wrong with it.
+        #[source]
+        source: ViewError,
+    },
+    /// No view is left.
+    #[error("found no usable view in {}", path.display())]
+    NoViews {
+        /// The scene.
+        path: PathBuf,
+    },
+}
+
+/// Why a view cannot be used.
+#[derive(Debug, Error, PartialEq)]
+pub enum ViewError {
+    /// Its camera is impossible.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// Its name is no safe path.
+    #[error(transparent)]
+    Name(#[from] NameError),
+    /// Its image has another shape than its camera.
+    #[error(transparent)]
+    Size(#[from] SizeMismatch),
+    /// Its lens follows a model that is not supported.
+    #[error("camera model {model} is not supported")]
+    UnsupportedModel {
+        /// The model's name in COLMAP.
+        model: &'static str,
+    },
+    /// Its camera file breaks the format.
+    #[error("its camera file {} {what}", path.display())]
+    CameraFile {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        what: String,
+    },
+}
+
+/// Reads the scene in a folder, whatever of the known layouts it has.
+///
+/// Views whose image is missing or has no readable header are left out with a warning; their ids
+/// vanish from tracks and pairs too.
+pub fn read_scene(root: &Path, options: &ReadOptions) -> Result<Scene, ReadError> {
+    let scene = if let Some(sparse) = colmap::find_model(root) {
+        colmap::read(root, &sparse, options)?
+    } else if mvsnet::is_scene(root) {
+        mvsnet::read(root, options)?
+    } else {
+        return Err(ReadError::NoScene { path: root.to_owned() });
+    };
+    if scene.views.is_empty() {
+        return Err(ReadError::NoViews { path: root.to_owned() });
+    }
+    Ok(scene)
+}
+
+fn read_bytes(path: &Path) -> Result<Vec<u8>, ReadError> {
+    fs::read(path).map_err(|source| ReadError::Io { path: path.to_owned(), source })
+}
+
+fn read_text(path: &Path) -> Result<String, ReadError> {
+    String::from_utf8(read_bytes(path)?).map_err(|error| {
+        let valid = &error.as_bytes()[..error.utf8_error().valid_up_to()];
+        let line = valid.split(|b| *b == b'\n').count();
+        ReadError::Text { path: path.to_owned(), line, what: "not UTF-8".to_owned() }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_without_a_scene_is_named() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let error = read_scene(folder.path(), &ReadOptions::default()).expect_err("empty");
+        assert!(matches!(&error, ReadError::NoScene { path } if path == folder.path()), "{error}");
+    }
+}
