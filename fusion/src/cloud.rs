@@ -36,3 +36,29 @@ pub fn emit(map: &FilteredMap) -> Vec<Point> {
         .collect();
     rows.concat()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::analytic::{Surface, camera_at};
+    use crate::filter::filter;
+    use crate::options::FilterOptions;
+
+    #[test]
+    fn kept_pixels_become_points_of_the_surface_in_row_order() {
+        let slope = -0.3;
+        let mut map = Surface::Plane { slope }.map(camera_at(0.2, 0.1, 12, 9));
+        map.depth.values_mut()[5] = 0.0;
+        let filtered = filter(&map, &[], &FilterOptions { min_views: 1, ..FilterOptions::default() });
+        let points = emit(&filtered);
+        assert_eq!(points.len() as u64, filtered.funnel.geometric);
+        assert_eq!(points.len(), 12 * 9 - 1);
+        for point in &points {
+            assert!((point.position[2] - slope * point.position[0]).abs() < 1e-6);
+            assert!((point.normal[2] + 1.0 / (1.0 + slope * slope).sqrt() as f32).abs() < 1e-3);
+        }
+        let last = map.camera.unproject(&Point2::new(11.0, 8.0), map.depth.at(11, 8) as f64);
+        assert!((last.x - points[106].position[0]).abs() < 1e-9);
+        assert_eq!(points[5].color, map.color.at(6, 0));
+    }
+}

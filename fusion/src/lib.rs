@@ -13,6 +13,8 @@
 
 #![warn(missing_docs)]
 
+#[cfg(test)]
+mod analytic;
 mod cloud;
 mod color;
 mod filter;
@@ -28,4 +30,4 @@ pub use filter::{FilteredMap, filter};
 pub use funnel::{EmptyCloud, FilterStep, Funnel};
 pub use normals::normals;
 pub use options::{DepthSampling, FilterOptions};
-pub use ply::{PlyError, PlyWriter, VERTEX_BYTES, encode, read_ply};
+pub use ply::{PlyError, PlyWriter, VERTEX_BYTES, encode, ply_header, read_ply};

@@ -70,3 +70,55 @@ impl Frame<'_> {
         (first != last).then(|| self.point(last.0, last.1) - self.point(first.0, first.1))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::analytic::{Surface, camera_at};
+
+    #[test]
+    fn the_normals_of_a_plane_are_its_own_everywhere() {
+        let slope = 0.4;
+        let map = Surface::Plane { slope }.map(camera_at(0.5, -0.3, 30, 24));
+        let truth = Vector3::new(slope, 0.0, -1.0).normalize();
+        for normal in normals(&map.camera, &map.depth).values() {
+            assert!((Vector3::from(normal.map(f64::from)) - truth).norm() < 1e-3, "{normal:?}");
+        }
+    }
+
+    #[test]
+    fn the_normals_of_a_ball_point_outwards_and_stop_at_its_edge() {
+        let map = Surface::BallBeforePlane.map(camera_at(0.0, 0.2, 120, 90));
+        let (mut on_ball, mut on_plane) = (0, 0);
+        let normals = normals(&map.camera, &map.depth);
+        for y in 0..90 {
+            for x in 0..120 {
+                let pixel = Point2::new(x as f64, y as f64);
+                let point = map.camera.unproject(&pixel, map.depth.at(x, y) as f64);
+                let normal = Vector3::from(normals.at(x, y).map(f64::from));
+                assert!((normal.norm() - 1.0).abs() < 1e-6);
+                let to_camera = (map.camera.pose.centre() - point).normalize();
+                assert!(normal.dot(&to_camera) > 0.0);
+                if point.z > 0.99 {
+                    on_plane += 1;
+                    assert!((normal + Vector3::z()).norm() < 1e-3, "{normal:?} at {x}, {y}");
+                } else if point.coords.normalize().dot(&to_camera) > 0.5 {
+                    on_ball += 1;
+                    assert!(normal.dot(&point.coords.normalize()) > 0.99, "{normal:?} at {x}, {y}");
+                }
+            }
+        }
+        assert!(on_ball > 500 && on_plane > 5000, "{on_ball} and {on_plane}");
+    }
+
+    #[test]
+    fn lone_pixels_face_the_camera_and_holes_have_none() {
+        let camera = camera_at(0.0, 0.0, 5, 3);
+        let depth = Raster::from_fn(5, 3, |x, y| if (x, y) == (4, 0) { 2.0 } else { 0.0 });
+        let normals = normals(&camera, &depth);
+        assert_eq!(normals.at(3, 0), [0.0; 3]);
+        let point = camera.unproject(&Point2::new(4.0, 0.0), 2.0);
+        let to_camera = (camera.pose.centre() - point).normalize();
+        assert!((Vector3::from(normals.at(4, 0).map(f64::from)) - to_camera).norm() < 1e-6);
+    }
+}

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use thiserror::Error;
 
 pub use read::read_ply;
-pub use write::{PlyWriter, VERTEX_BYTES, encode};
+pub use write::{PlyWriter, VERTEX_BYTES, encode, ply_header};
 
 /// Why a PLY file could not be written or read.
 #[derive(Debug, Error)]
@@ -39,7 +39,7 @@ pub enum PlyError {
         path: PathBuf,
         /// Vertices in the header.
         announced: u64,
-        /// Vertices written.
+        /// Whole vertices written.
         written: u64,
     },
     /// The file cannot be opened or read.

@@ -290,3 +290,126 @@ fn read_ascii(reader: &mut impl BufRead, header: &Header) -> Result<Vec<Point>, 
     }
     Ok(points)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn read_bytes(bytes: &[u8]) -> Result<Vec<Point>, PlyError> {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("cloud.ply");
+        fs::write(&path, bytes).expect("written");
+        read_ply(&path)
+    }
+
+    fn problem(bytes: &[u8]) -> String {
+        match read_bytes(bytes) {
+            Err(PlyError::Malformed { problem, .. }) => problem,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    const BINARY: &str = "ply\nformat binary_little_endian 1.0\ncomment x\nelement vertex 2\n\
+        property uchar blue\nproperty double z\nproperty short label\nproperty float x\nproperty int y\n\
+        property uchar red\nproperty uchar green\nend_header\n";
+
+    fn binary_vertex(x: f32, y: i32, z: f64, [r, g, b]: [u8; 3]) -> Vec<u8> {
+        [&[b][..], &z.to_le_bytes(), &[7, 7], &x.to_le_bytes(), &y.to_le_bytes(), &[r, g]].concat()
+    }
+
+    #[test]
+    fn binary_properties_come_in_any_order_and_type() {
+        let body = [binary_vertex(1.5, -2, 3.25, [1, 2, 3]), binary_vertex(0.0, 9, 1e9, [4, 5, 6])].concat();
+        let points = read_bytes(&[BINARY.as_bytes(), &body].concat()).expect("well-formed");
+        let point = |position, color| Point { position, normal: [0.0; 3], color };
+        assert_eq!(points, [point([1.5, -2.0, 3.25], [1, 2, 3]), point([0.0, 9.0, 1e9], [4, 5, 6])]);
+    }
+
+    #[test]
+    fn ascii_with_faces_after_the_vertices_is_read() {
+        let text = "ply\r\nformat ascii 1.0\r\nelement vertex 2\r\nproperty float x\r\nproperty float y\r\n\
+            property float z\r\nproperty float nz\r\nproperty float diffuse_red\r\nelement face 1\r\n\
+            property list uchar int vertex_indices\r\nend_header\r\n1 2 3 -1 0.5\r\n4 5 6 1 1\r\n3 0 1 1\r\n";
+        let points = read_bytes(text.as_bytes()).expect("well-formed");
+        assert_eq!(points.len(), 2);
+        assert_eq!(
+            points[0],
+            Point { position: [1.0, 2.0, 3.0], normal: [0.0, 0.0, -1.0], color: [128, 0, 0] }
+        );
+        assert_eq!(points[1].color, [255, 0, 0]);
+    }
+
+    #[test]
+    fn what_is_wrong_is_named() {
+        let body = binary_vertex(1.0, 2, 3.0, [0; 3]);
+        let with = |bytes: &[u8]| problem(&[BINARY.as_bytes(), bytes].concat());
+        assert_eq!(with(&body), "2 vertices do not fit in the 21 bytes after the header");
+        assert_eq!(with(&[&body[..], &body, &[0]].concat()), "1 bytes follow the last of 2 vertices");
+        let change = |from: &str, to: &str| problem(BINARY.replace(from, to).as_bytes());
+        assert!(change("vertex 2", "vertex 18446744073709551615").contains("do not fit"));
+        assert!(change("vertex 2", "vertex -1").contains("has no count"));
+        assert!(change("float x", "float u").contains("\"x\" is there 0 times"));
+        assert!(change("float x", "list uchar int x").contains("not understood"));
+        assert!(change("float x", "half x").contains("unknown type"));
+        assert!(change("short label", "float x").contains("\"x\" is there 2 times"));
+        assert!(change("element vertex", "element face").contains("not \"vertex\""));
+        assert!(change("binary_little_endian", "binary_big_endian").contains("not understood"));
+        assert!(change("end_header", "comment").contains("does not end"));
+        assert_eq!(problem(b"PLY\n"), "the first line is not \"ply\"");
+        let ascii = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n\
+            property float z\nend_header\n";
+        let with = |body: &str| problem([ascii, body].concat().as_bytes());
+        assert_eq!(with("1 2 3,5\n"), "vertex 0 lacks a number in \"1 2 3,5\"");
+        assert_eq!(with("1 2 3 4\n"), "vertex 0 has more numbers than properties");
+        assert_eq!(with("1 2 3\n4 5 6\n"), "more lines follow the last of 1 vertices");
+        assert!(matches!(read_ply(Path::new("/no/cloud.ply")), Err(PlyError::Read { .. })));
+    }
+
+    #[test]
+    fn colmaps_own_cloud_is_read_and_written_to_the_same_bytes() {
+        let path = Path::new(concat!(
+            env!("CARGO_MANIFEST_DIR"),
+            "/../../shared/data/colmap/testColmap/dense/fused.ply"
+        ));
+        if !path.exists() {
+            eprintln!(
+                "SKIPPED colmaps_own_cloud_is_read_and_written_to_the_same_bytes: {} is not there",
+                path.display()
+            );
+            return;
+        }
+        let points = read_ply(path).expect("COLMAP's file");
+        assert_eq!(points.len(), 11);
+        // As `od -t f4` shows them.
+        assert_eq!(points[8].position, [-1185172.75, 52148.0625, 3400783.0]);
+        assert_eq!(points[8].color, [141, 112, 108]);
+        let folder = tempfile::tempdir().expect("a folder");
+        let copy = folder.path().join("copy.ply");
+        let mut writer = super::super::PlyWriter::create(&copy, 11).expect("created");
+        writer.write(&points).expect("written");
+        writer.finish().expect("finished");
+        assert_eq!(fs::read(copy).expect("read"), fs::read(path).expect("read"));
+    }
+
+    proptest! {
+        #[test]
+        fn damaged_files_are_refused_or_read_but_never_panic(
+            at in 0..400_usize,
+            byte in any::<u8>(),
+            length in 0..400_usize,
+        ) {
+            let body = [binary_vertex(1.5, -2, 3.25, [1, 2, 3]), binary_vertex(0.0, 9, 1e9, [4, 5, 6])].concat();
+            let mut bytes = [BINARY.as_bytes(), &body].concat();
+            let (at, length) = (at % bytes.len(), length % bytes.len());
+            bytes[at] = byte;
+            if let Ok(points) = read_bytes(&bytes) {
+                prop_assert!(points.len() <= bytes.len());
+            }
+            prop_assert!(read_bytes(&bytes[..length]).is_err());
+        }
+    }
+}

@@ -37,7 +37,7 @@ pub struct PlyWriter {
     path: PathBuf,
     file: BufWriter<NamedTempFile>,
     announced: u64,
-    written: u64,
+    written_bytes: u64,
 }
 
 impl PlyWriter {
@@ -55,9 +55,9 @@ impl PlyWriter {
             path: path.to_path_buf(),
             file: BufWriter::with_capacity(1 << 20, file),
             announced: vertices,
-            written: 0,
+            written_bytes: 0,
         };
-        writer.write_all(header(vertices).as_bytes())?;
+        writer.write_all(ply_header(vertices).as_bytes())?;
         Ok(writer)
     }
 
@@ -66,18 +66,18 @@ impl PlyWriter {
         points.chunks(1 << 16).try_for_each(|chunk| self.write_encoded(&encode(chunk)))
     }
 
-    /// Appends points that [`encode`] made bytes of; a part of a vertex at the end is not counted and
-    /// makes [`Self::finish`] fail.
+    /// Appends points that [`encode`] made bytes of.
     pub fn write_encoded(&mut self, vertices: &[u8]) -> Result<(), PlyError> {
-        self.written += (vertices.len() / VERTEX_BYTES) as u64;
+        self.written_bytes += vertices.len() as u64;
         self.write_all(vertices)
     }
 
     /// Flushes the file to disk and gives it its name, replacing what was there; refused when not
     /// exactly the announced number of vertices was written.
     pub fn finish(self) -> Result<(), PlyError> {
-        let Self { path, file, announced, written } = self;
-        if written != announced {
+        let Self { path, file, announced, written_bytes } = self;
+        if announced.checked_mul(VERTEX_BYTES as u64) != Some(written_bytes) {
+            let written = written_bytes / VERTEX_BYTES as u64;
             return Err(PlyError::Count { path, announced, written });
         }
         let placed = (|| {
@@ -95,7 +95,8 @@ impl PlyWriter {
     }
 }
 
-fn header(vertices: u64) -> String {
+/// The header of a file of `vertices` points in the layout of [`encode`].
+pub fn ply_header(vertices: u64) -> String {
     let properties: String = ["x", "y", "z", "nx", "ny", "nz"]
         .map(|name| ("float", name))
         .into_iter()
@@ -103,4 +104,65 @@ fn header(vertices: u64) -> String {
         .map(|(scalar, name)| ["property ", scalar, " ", name, "\n"].concat())
         .collect();
     format!("ply\nformat binary_little_endian 1.0\nelement vertex {vertices}\n{properties}end_header\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::super::read_ply;
+    use super::*;
+
+    fn points(count: usize) -> Vec<Point> {
+        (0..count)
+            .map(|i| Point {
+                position: [i as f64, -0.5, 1e6],
+                normal: [0.0, 0.6, -0.8],
+                color: [i as u8, 128, 255],
+            })
+            .collect()
+    }
+
+    #[test]
+    fn what_is_written_is_read_back() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("cloud.ply");
+        let points = points(70_000);
+        let mut writer = PlyWriter::create(&path, 70_000).expect("created");
+        writer.write(&points[..69_000]).expect("written");
+        writer.write_encoded(&encode(&points[69_000..])).expect("written");
+        assert!(!path.exists(), "nothing stands under the name before the end");
+        writer.finish().expect("finished");
+        assert_eq!(read_ply(&path).expect("read"), points);
+        let bytes = fs::read(&path).expect("read");
+        assert_eq!(bytes.len() as u64, ply_header(70_000).len() as u64 + 70_000 * 27);
+        assert_eq!(fs::read_dir(folder.path()).expect("listed").count(), 1);
+    }
+
+    #[test]
+    fn a_wrong_count_leaves_the_old_file() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("cloud.ply");
+        fs::write(&path, "old").expect("written");
+        for count in [2, 4] {
+            let mut writer = PlyWriter::create(&path, 3).expect("created");
+            writer.write(&points(count)).expect("written");
+            let error = writer.finish().expect_err("another count");
+            assert!(
+                matches!(error, PlyError::Count { announced: 3, written, .. } if written == count as u64)
+            );
+        }
+        let mut writer = PlyWriter::create(&path, 3).expect("created");
+        writer.write_encoded(&[0; 3 * VERTEX_BYTES + 1]).expect("written");
+        writer.finish().expect_err("a part of a vertex too many");
+        assert_eq!(fs::read_to_string(&path).expect("read"), "old");
+        assert_eq!(fs::read_dir(folder.path()).expect("listed").count(), 1);
+    }
+
+    #[test]
+    fn a_missing_folder_is_named() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let error = PlyWriter::create(&folder.path().join("no/cloud.ply"), 1).expect_err("no folder");
+        assert!(error.to_string().ends_with("no/cloud.ply"), "{error}");
+    }
 }
