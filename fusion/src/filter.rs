@@ -493,4 +493,24 @@ mod tests {
         assert!(one.funnel.geometric > 100 && one.funnel.geometric < one.funnel.photometric);
         assert_eq!(one, with(2));
     }
+
+    #[test]
+    fn wider_registers_change_no_bit() {
+        let noise: Vec<_> =
+            (0..991).map(|i| ((i as f32 * 0.3).sin(), 0.75 + (i as f32).sin() / 4.0)).collect();
+        let maps: Vec<_> = PLACES.iter().map(|(x, y)| noisy_map(camera_at(*x, *y, 61, 43), &noise)).collect();
+        let options = FilterOptions::default();
+        let dispatched = filter_first(&maps, &options);
+        let neighbours: Vec<_> = maps[1..].iter().map(|map| Neighbour::new(&maps[0].camera, map)).collect();
+        let mut row = RowFilter::default();
+        for y in 0..43 {
+            let (mut depth, mut color, mut views) = ([0.0; 61], [[0; 3]; 61], [0; 61]);
+            let mut out = OutputRow { depth: &mut depth, color: &mut color, views: &mut views };
+            row.run_any(&maps[0], &neighbours, &options, y, &mut out);
+            assert_eq!(depth, dispatched.depth.row(y));
+            assert_eq!(color, dispatched.color.row(y));
+            assert_eq!(views, dispatched.views.row(y));
+        }
+        assert!(dispatched.funnel.geometric > 100);
+    }
 }
