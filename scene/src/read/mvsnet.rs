@@ -190,3 +190,45 @@ fn depth_range(line: &[f64], options: &ReadOptions) -> Option<DepthRange> {
     };
     (min > 0.0 && max > min && max.is_finite()).then_some(DepthRange { min, max, count })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn range(line: &[f64], options: &ReadOptions) -> Option<(f64, f64, Option<u32>)> {
+        depth_range(line, options).map(|r| (r.min, r.max, r.count))
+    }
+
+    #[test]
+    fn two_numbers_are_told_apart_by_value_or_option() {
+        let auto = ReadOptions::default();
+        let dtu = range(&[425.0, 2.5], &auto).expect("min, interval");
+        assert!((dtu.1 - (425.0 + 2.5 * 1.06 * 191.0)).abs() < 1e-9 && dtu.2.is_none());
+        assert_eq!(range(&[4.0, 8.5], &auto), Some((4.0, 8.5, None)));
+        let interval = ReadOptions { depth_line: DepthLine::Interval, ..auto.clone() };
+        assert!(range(&[0.1, 0.2], &interval).expect("a range").1 > 40.0);
+        let max = ReadOptions { depth_line: DepthLine::MinMax, ..auto.clone() };
+        assert_eq!(range(&[425.0, 2.5], &max), None);
+        let planes = ReadOptions { plane_count: Some(257), interval_scale: Some(0.5), ..auto };
+        assert_eq!(range(&[425.0, 2.5], &planes), Some((425.0, 425.0 + 2.5 * 128.0, None)));
+    }
+
+    #[test]
+    fn three_and_four_numbers_state_the_number_of_planes() {
+        let options = ReadOptions::default();
+        assert_eq!(range(&[2.0, 0.5, 11.0], &options), Some((2.0, 7.0, Some(11))));
+        assert_eq!(range(&[2.0, 0.5, 11.0, 99.0], &options), Some((2.0, 7.0, Some(11))));
+        let scaled = ReadOptions { interval_scale: Some(2.0), ..options };
+        assert_eq!(range(&[2.0, 0.5, 11.0, 7.0], &scaled), Some((2.0, 12.0, Some(11))));
+    }
+
+    #[test]
+    fn lines_that_state_no_range_give_none() {
+        let options = ReadOptions::default();
+        for line in
+            [&[][..], &[1.0], &[0.0, 1.0], &[1.0, -1.0], &[1.0, 0.5, 1.0], &[1.0, 0.5, 1e300, 2.0, 3.0]]
+        {
+            assert_eq!(depth_range(line, &options), None, "{line:?}");
+        }
+    }
+}
