@@ -21,7 +21,9 @@ pub(crate) fn cost_volume(
 ) -> Result<Tensor, TchError> {
     let (_, channels, height, width) = reference.size4()?;
     let options = (reference.kind(), reference.device());
-    let volume = Tensor::f_empty([1, channels, depths.len() as i64, height, width], options)?;
+    // Channels innermost: on the CPU, 3D convolution takes half the time and memory with them there.
+    let size = [1, depths.len() as i64, height, width, channels];
+    let volume = Tensor::f_empty(size, options)?.f_permute([0, 4, 1, 2, 3])?;
     let views = (sources.len() + 1) as f64;
     for (i, depths) in depths.chunks(PLANES).enumerate() {
         let planes = depths.len() as i64;

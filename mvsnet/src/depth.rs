@@ -66,3 +66,64 @@ pub(crate) fn spacing_px(reference: &Camera, source: &Camera, hypotheses: &Depth
         _ => 0.0,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Point3, Vector3};
+    use planesweep_scene::{Intrinsics, Pose};
+    use tch::Device;
+
+    use super::*;
+
+    /// Probabilities of one pixel.
+    fn pixel(probability: &[f64]) -> Tensor {
+        Tensor::from_slice(probability).view([-1, 1, 1])
+    }
+
+    #[test]
+    fn expectation_is_over_depth_or_over_inverse_depth() {
+        let index = expected_index(&pixel(&[0.5, 0.0, 0.5])).expect("an expectation");
+        let depth = |sampling| {
+            let hypotheses = DepthHypotheses::new(sampling, 2.0, 6.0, 3).expect("a valid range");
+            depth_at(&index, &hypotheses).expect("a depth").double_value(&[0, 0])
+        };
+        assert!((depth(Sampling::Uniform) - 4.0).abs() < 1e-12);
+        assert!((depth(Sampling::Inverse) - 3.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn confidence_is_the_sum_around_the_expectation_and_zero_outside() {
+        let p = [0.05, 0.1, 0.2, 0.3, 0.2, 0.1, 0.05];
+        let at = |index: f64, window| {
+            let index = Tensor::full([1, 1], index, (Kind::Double, Device::Cpu));
+            confidence(&pixel(&p), &index, window).expect("a confidence").double_value(&[0, 0])
+        };
+        assert!((at(3.4, 4) - 0.8).abs() < 1e-12);
+        assert!((at(2.9, 4) - 0.8).abs() < 1e-12);
+        assert!((at(3.4, 6) - 0.95).abs() < 1e-12);
+        assert!((at(0.0, 4) - 0.35).abs() < 1e-12);
+        assert!((at(6.0, 4) - 0.15).abs() < 1e-12);
+    }
+
+    #[test]
+    fn window_widens_with_finer_hypotheses_only() {
+        assert_eq!(confidence_window(None, 0.1), 4);
+        assert_eq!(confidence_window(Some(1.0), 1.5), 4);
+        assert_eq!(confidence_window(Some(1.0), 0.5), 8);
+        assert_eq!(confidence_window(Some(1.0), 0.7), 6);
+        assert_eq!(confidence_window(Some(1.0), 0.0), 4);
+    }
+
+    #[test]
+    fn spacing_is_the_step_of_disparity() {
+        let camera = |x| {
+            let intrinsics =
+                Intrinsics { width: 101, height: 81, fx: 100.0, fy: 100.0, skew: 0.0, cx: 50.0, cy: 40.0 };
+            let pose = Pose::look_at(&Point3::new(x, 0.0, 0.0), &Point3::new(x, 0.0, 1.0), &-Vector3::y());
+            Camera { intrinsics, pose }
+        };
+        // Disparity is focal length times baseline over depth: 100 * 0.5 * (1/2 - 1/4) over 10 steps.
+        let hypotheses = DepthHypotheses::new(Sampling::Inverse, 2.0, 4.0, 11).expect("a valid range");
+        assert!((spacing_px(&camera(0.0), &camera(0.5), &hypotheses) - 1.25).abs() < 1e-9);
+    }
+}

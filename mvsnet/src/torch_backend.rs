@@ -206,6 +206,17 @@ mod tests {
     }
 
     #[test]
+    fn number_of_threads_changes_no_bit() {
+        let images = Images::new(320, 256, Sampling::Uniform);
+        let weights = Weights::seeded(WeightsMetadata::untrained(Refinement::Paper), 3);
+        let [one, two] = [1, 2].map(|threads| {
+            let mut backend = TorchBackend::new(&weights, "cpu", threads).expect("the CPU is there");
+            images.infer(&mut backend).expect("a depth map")
+        });
+        assert_eq!(one, two);
+    }
+
+    #[test]
     fn probability_at_a_pixel_sums_to_one() {
         let images = Images::new(64, 40, Sampling::Uniform);
         let sources: Vec<_> = images.sources.iter().collect();

@@ -87,3 +87,85 @@ impl PlaneSweep {
             .f_permute([0, 2, 3, 1])
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Matrix3, Point2, Point3};
+    use planesweep_scene::{Camera, Intrinsics, Pose};
+    use tch::Kind;
+
+    use super::*;
+
+    fn camera(centre: Point3<f64>, target: Point3<f64>) -> Camera {
+        let (width, height) = (12, 9);
+        let intrinsics = Intrinsics { width, height, fx: 11.0, fy: 12.0, skew: 0.4, cx: 5.7, cy: 4.1 };
+        Camera { intrinsics, pose: Pose::look_at(&centre, &target, &-Vector3::y()) }
+    }
+
+    fn reference() -> Camera {
+        camera(Point3::new(0.1, -0.2, 0.3), Point3::new(0.3, 0.1, 5.0))
+    }
+
+    fn sweep(source: &Camera) -> PlaneSweep {
+        let size = (12, 9);
+        PlaneSweep::new(&reference().projection(), size, &source.projection(), size, Device::Cpu)
+            .expect("an invertible camera")
+            .expect("a tensor")
+    }
+
+    #[test]
+    fn homography_is_the_corrected_equation_1() {
+        let (reference, source) =
+            (reference(), camera(Point3::new(1.0, 0.5, -0.5), Point3::new(0.0, 0.0, 4.0)));
+        let (depth, pixel) = (3.7, Point2::new(4.0, 6.0));
+        let baseline = source.pose.centre() - reference.pose.centre();
+        let normal = reference.pose.rotation.row(2);
+        let inverse = reference.intrinsics.matrix().try_inverse().expect("focal lengths are positive");
+        let homography = source.intrinsics.matrix()
+            * source.pose.rotation
+            * (Matrix3::identity() - baseline * normal / depth)
+            * reference.pose.rotation.transpose()
+            * inverse;
+        let expected = homography * pixel.to_homogeneous();
+
+        let grid = sweep(&source).grid(&[1.0, depth]).expect("a grid");
+        let x = (grid.double_value(&[1, 6, 4, 0]) + 1.0) * 11.0 / 2.0;
+        let y = (grid.double_value(&[1, 6, 4, 1]) + 1.0) * 8.0 / 2.0;
+        assert!((x - expected.x / expected.z).abs() < 1e-12 && (y - expected.y / expected.z).abs() < 1e-12);
+        let (seen, _) = source.project(&reference.unproject(&pixel, depth)).expect("in front");
+        assert!((x - seen.x).abs() < 1e-12 && (y - seen.y).abs() < 1e-12);
+    }
+
+    #[test]
+    fn own_features_stay_where_they_are() {
+        let features = Tensor::rand([1, 2, 9, 12], (Kind::Float, Device::Cpu));
+        let warped = sweep(&reference()).apply(&features, &[1.0, 9.0]).expect("features");
+        assert_eq!(warped.size(), [2, 2, 9, 12]);
+        assert!((warped - features).abs().max().double_value(&[]) < 1e-5);
+    }
+
+    #[test]
+    fn what_is_behind_the_source_camera_is_zero() {
+        // It looks the other way, so every plane lies behind it, where the homography mirrors the image.
+        let away = camera(Point3::new(0.0, 0.0, 0.0), Point3::new(0.0, 0.0, -5.0));
+        let features = Tensor::ones([1, 1, 9, 12], (Kind::Float, Device::Cpu));
+        let warped = sweep(&away).apply(&features, &[1.0, 2.0, 50.0]).expect("features");
+        assert_eq!(warped.abs().max().double_value(&[]), 0.0);
+    }
+
+    #[test]
+    fn planes_through_the_source_centre_give_finite_features() {
+        let on_axis = |depth| reference().pose.to_world(&Point3::new(0.0, 0.0, depth));
+        let ahead = camera(on_axis(2.0), on_axis(9.0));
+        let features = Tensor::ones([1, 1, 9, 12], (Kind::Float, Device::Cpu));
+        let warped = sweep(&ahead).apply(&features, &[2.0, 2.0 + 1e-15]).expect("features");
+        assert!(warped.isfinite().all().int64_value(&[]) == 1);
+    }
+
+    #[test]
+    fn singular_reference_is_refused() {
+        let source = camera(Point3::origin(), Point3::new(0.0, 0.0, 1.0)).projection();
+        let none = PlaneSweep::new(&Matrix3x4::zeros(), (12, 9), &source, (12, 9), Device::Cpu);
+        assert!(none.is_none());
+    }
+}

@@ -1,5 +1,6 @@
 //! Golden values: what PyTorch makes of the same input, stage by stage.
 
+mod own_cases;
 mod reference_case;
 
 use tch::{Device, Kind, Tensor};

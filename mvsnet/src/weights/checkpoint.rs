@@ -204,3 +204,82 @@ fn gather(tensor: &TensorRef, storage: Storage, bytes: &[u8]) -> Result<WeightTe
     }
     Ok(WeightTensor { shape: tensor.shape.clone(), values })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    // Made by tests/golden/make_checkpoints.py.
+    const LEGACY: &[u8] = include_bytes!("../../tests/golden/legacy.ckpt");
+    const ZIP: &[u8] = include_bytes!("../../tests/golden/zip.ckpt");
+    const CODE: &[u8] = include_bytes!("../../tests/golden/code.ckpt");
+
+    #[test]
+    fn both_formats_give_the_network_without_prefix_optimiser_and_counters() {
+        for bytes in [LEGACY, ZIP] {
+            let tensors = read(bytes).expect("a checkpoint");
+            let tensor = |name: &str| (tensors[name].shape.as_slice(), tensors[name].values.as_slice());
+            assert_eq!(tensors.keys().collect::<Vec<_>>(), ["double", "half", "part", "plain", "transposed"]);
+            assert_eq!(tensor("plain"), (&[2, 3][..], &[0.0, 1.0, 2.0, 3.0, 4.0, 5.0][..]));
+            assert_eq!(tensor("transposed"), (&[3, 2][..], &[0.0, 3.0, 1.0, 4.0, 2.0, 5.0][..]));
+            assert_eq!(tensor("part"), (&[2][..], &[2.0, 3.0][..]));
+            assert_eq!(tensor("half"), (&[2][..], &[0.5, -2.0][..]));
+            assert_eq!(tensor("double"), (&[1][..], &[0.25][..]));
+        }
+    }
+
+    #[test]
+    fn code_in_a_checkpoint_is_refused_by_name() {
+        let error = read(CODE).expect_err("code");
+        assert!(
+            matches!(&error, CheckpointError::Pickle(PickleError::Forbidden { name, .. }) if name == "posix.system"),
+            "{error:?}"
+        );
+    }
+
+    #[test]
+    fn truncated_checkpoints_are_refused_wherever_they_end() {
+        for bytes in [LEGACY, ZIP] {
+            for len in (0..bytes.len()).step_by(7) {
+                assert!(read(&bytes[..len]).is_err(), "{len} of {} bytes", bytes.len());
+            }
+        }
+        let error = read(&LEGACY[..LEGACY.len() - 1]).expect_err("a byte is missing");
+        assert!(matches!(error, CheckpointError::Storage { .. }), "{error:?}");
+    }
+
+    #[test]
+    fn damaged_bytes_do_not_panic() {
+        for bytes in [LEGACY, ZIP] {
+            for at in 0..bytes.len() {
+                let mut damaged = bytes.to_vec();
+                damaged[at] ^= 0x5a;
+                let _ = read(&damaged);
+            }
+        }
+    }
+
+    #[test]
+    fn tensors_beyond_their_storage_are_refused() {
+        let storage = Storage { element: ElementType::F32, len: 6 };
+        let view = |offset, shape: &[usize], strides: &[usize]| {
+            let tensor =
+                TensorRef { storage: "0".into(), offset, shape: shape.to_vec(), strides: strides.to_vec() };
+            gather(&tensor, storage, &[0; 24]).map(|tensor| tensor.values.len())
+        };
+        assert_eq!(view(0, &[2, 3], &[3, 1]), Ok(6));
+        assert_eq!(view(1, &[2, 3], &[3, 1]), Err("it reaches beyond its elements"));
+        assert_eq!(view(0, &[2], &[usize::MAX]), Err("it reaches beyond its elements"));
+        assert_eq!(view(0, &[usize::MAX, 2], &[0, 0]), Err("it is too large"));
+        assert_eq!(view(0, &[1 << 30], &[0]), Err("it is too large"));
+        assert_eq!(view(0, &[2, 3], &[1]), Err("its strides do not match its shape"));
+        assert_eq!(view(9, &[0], &[1]), Ok(0));
+    }
+
+    #[test]
+    fn other_files_are_told_apart() {
+        assert!(matches!(read(b"\x89PNG\r\n"), Err(CheckpointError::NotACheckpoint { .. })));
+        assert!(matches!(read(b""), Err(CheckpointError::NotACheckpoint { .. })));
+        assert!(matches!(read(b"PK\x03\x04"), Err(CheckpointError::Zip(_))));
+    }
+}

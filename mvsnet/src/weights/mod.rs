@@ -18,6 +18,8 @@ pub use checkpoint::CheckpointError;
 #[cfg(feature = "torch")]
 pub(crate) use folded::{FoldedConvolution, KernelOrder};
 pub use pickle::PickleError;
+#[cfg(all(test, feature = "torch"))]
+pub(crate) use seeded::uniform;
 
 /// A hundred times the largest checkpoint of this network.
 const MAX_CHECKPOINT_BYTES: u64 = 1 << 29;

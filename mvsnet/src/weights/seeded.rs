@@ -48,6 +48,8 @@ fn range(name: &str, shape: &[usize]) -> (f64, f64) {
         // A stride of two leaves an output of a transposed layer an eighth of the taps.
         let fan_in = if transposed { fan_in as f64 / 8.0 } else { fan_in as f64 };
         let bound = (6.0 / fan_in).sqrt();
+        // Residuals are small, so that refined depth stays in the range.
+        let bound = if name.starts_with("refine_network.res") { 0.1 * bound } else { bound };
         (-bound, bound)
     } else if name.ends_with("running_var") || name.ends_with("bn.weight") || name.ends_with(".1.weight") {
         (0.5, 1.5)
@@ -57,7 +59,7 @@ fn range(name: &str, shape: &[usize]) -> (f64, f64) {
 }
 
 /// The next number of [0, 1), a multiple of 2^-24.
-fn uniform(state: &mut u64) -> f64 {
+pub(crate) fn uniform(state: &mut u64) -> f64 {
     *state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
     let mut z = *state;
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
