@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use planesweep_fusion::DepthSampling;
 use planesweep_scene::{Camera, DepthHypotheses, Distortion, Sampling, Scene, ViewId};
 use thiserror::Error;
 
@@ -107,6 +108,10 @@ fn job(spec: JobSpec, needs: Vec<JobId>) -> Job {
             digest.f64(options.max_reprojection_px as f64);
             digest.f64(options.max_relative_depth as f64);
             digest.u32(options.min_views);
+            digest.u32(match options.sampling {
+                DepthSampling::Bilinear => 0,
+                DepthSampling::Continuous => 1,
+            });
         }
         JobSpec::Emit(_) | JobSpec::Assemble(_) => {}
     }

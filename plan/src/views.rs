@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::{Point2, Point3};
-use planesweep_scene::{Camera, DepthRange, Scene, SourceScore, SparsePoints, ViewId};
+use planesweep_scene::{Camera, DepthRange, Scene, SourceScore, SparsePoints, View, ViewId};
 use rayon::prelude::*;
 
 /// The baseline angle that counts most, in degrees.
@@ -36,18 +36,19 @@ fn angle_deg(point: &Point3<f64>, centre_a: &Point3<f64>, centre_b: &Point3<f64>
     a.cross(&b).norm().atan2(a.dot(&b)).to_degrees()
 }
 
-/// Ranks source views by what the scene knows: common tracks, else its pair file, else the overlap
-/// of frusta between `ranges`.
+/// Ranks source views by what the scene knows: common tracks, else its pair file, else (for views
+/// that the pair file leaves out, too) the overlap of frusta between `ranges`.
 pub fn rank_sources(scene: &Scene, ranges: &BTreeMap<ViewId, DepthRange>) -> SourceRanking {
     if !scene.points.is_empty() {
-        rank_by_tracks(scene)
-    } else if !scene.pairs.is_empty() {
-        let known = |score: &SourceScore| scene.views.contains_key(&score.view);
-        let listed = scene.pairs.iter().filter(|(id, _)| scene.views.contains_key(id));
-        listed.map(|(id, sources)| (*id, sources.iter().copied().filter(known).collect())).collect()
-    } else {
-        rank_by_overlap(scene, ranges)
+        return rank_by_tracks(scene);
     }
+    let known = |score: &SourceScore| scene.views.contains_key(&score.view);
+    let listed = scene.pairs.iter().filter(|(id, _)| scene.views.contains_key(id));
+    let mut ranking: SourceRanking =
+        listed.map(|(id, sources)| (*id, sources.iter().copied().filter(known).collect())).collect();
+    let unlisted: Vec<&View> = scene.views.values().filter(|view| !ranking.contains_key(&view.id)).collect();
+    ranking.par_extend(unlisted.par_iter().map(|view| (view.id, rank_by_overlap(scene, ranges, view))));
+    ranking
 }
 
 /// The paper's score: the sum over common tracks of [`angle_score`].
@@ -138,31 +139,24 @@ impl<'a> Tracks<'a> {
     }
 }
 
-/// Scores a pair by the grid points of the reference frustum that the source sees, each weighted by
-/// its baseline angle.
-fn rank_by_overlap(scene: &Scene, ranges: &BTreeMap<ViewId, DepthRange>) -> SourceRanking {
-    let views: Vec<_> = scene.views.values().collect();
-    views
-        .par_iter()
-        .map(|reference| {
-            let points = match ranges.get(&reference.id) {
-                Some(range) => frustum_points(&reference.camera, range),
-                None => Vec::new(),
-            };
-            let centre = reference.camera.pose.centre();
-            let score_of = |source: &Camera| -> f64 {
-                let other = source.pose.centre();
-                let seen = points.iter().filter(|point| sees(source, point));
-                seen.map(|point| angle_score(angle_deg(point, &centre, &other))).sum()
-            };
-            let scores = views
-                .iter()
-                .filter(|source| source.id != reference.id)
-                .map(|source| SourceScore { view: source.id, score: score_of(&source.camera) })
-                .filter(|source| source.score > 0.0);
-            (reference.id, ranked(scores.collect()))
-        })
-        .collect()
+/// Scores each source by the grid points of the reference frustum that it sees, each weighted by its
+/// baseline angle.
+fn rank_by_overlap(
+    scene: &Scene,
+    ranges: &BTreeMap<ViewId, DepthRange>,
+    reference: &View,
+) -> Vec<SourceScore> {
+    let range = ranges.get(&reference.id);
+    let points = range.map_or_else(Vec::new, |range| frustum_points(&reference.camera, range));
+    let centre = reference.camera.pose.centre();
+    let score_of = |source: &Camera| -> f64 {
+        let other = source.pose.centre();
+        let seen = points.iter().filter(|point| sees(source, point));
+        seen.map(|point| angle_score(angle_deg(point, &centre, &other))).sum()
+    };
+    let others = scene.views.values().filter(|source| source.id != reference.id);
+    let scores = others.map(|source| SourceScore { view: source.id, score: score_of(&source.camera) });
+    ranked(scores.filter(|source| source.score > 0.0).collect())
 }
 
 /// Whether a world point falls into the image.
@@ -197,7 +191,7 @@ fn ranked(mut scores: Vec<SourceScore>) -> Vec<SourceScore> {
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector3;
-    use planesweep_scene::{Distortion, Intrinsics, Pose, View};
+    use planesweep_scene::{Distortion, Intrinsics, Pose};
 
     use super::*;
 
@@ -274,5 +268,17 @@ mod tests {
         let ranking = rank_sources(&scene, &ranges);
         assert_eq!(ranking[&ViewId(1)][0].view, ViewId(11));
         assert!(rank_sources(&scene, &BTreeMap::new())[&ViewId(1)].is_empty());
+    }
+
+    #[test]
+    fn a_pair_file_that_leaves_views_out_is_completed_by_overlap() {
+        let mut scene = scene_with_centres(&[0.0, 1.0, 2.0]);
+        let stated = |view: u32| SourceScore { view: ViewId(view), score: 1.0 };
+        scene.pairs.insert(ViewId(1), vec![stated(21), stated(99)]);
+        let range = DepthRange { min: 8.0, max: 12.0, count: None };
+        let ranges = scene.views.keys().map(|id| (*id, range)).collect();
+        let ranking = rank_sources(&scene, &ranges);
+        assert_eq!(ranking[&ViewId(1)], [stated(21)]);
+        assert_eq!(ranking[&ViewId(11)].len(), 2);
     }
 }

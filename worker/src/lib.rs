@@ -1,1 +1,31 @@
 //! Doing it: leases jobs, infers or fuses, stores the result and reports it.
+//!
+//! ```text
+//! coordinator <── agent (the report loop) ── held (what it holds, pure)
+//!                   │ spawns
+//!                   └─> jobs (one job from grant to stored result)
+//!                         ├─ images ── device (one thread owns the network)
+//!                         ├─ cloud
+//!                         └─ store (the truth of every result) ── blob (maps as bytes)
+//! ```
+//!
+//! A worker needs the coordinator's address, nothing else: where results lie, which weights to use
+//! and what to do come with the replies.
+#![warn(missing_docs)]
+
+mod agent;
+mod blob;
+mod cloud;
+mod device;
+mod failure;
+mod held;
+mod images;
+mod jobs;
+mod store;
+
+pub use agent::{WorkerConfig, WorkerError, run_worker};
+pub use blob::{
+    BlobError, decode_depth_map, decode_filtered_map, decode_points, encode_depth_map, encode_filtered_map,
+};
+pub use device::BackendFactory;
+pub use store::{Store, StoreError};

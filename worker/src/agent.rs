@@ -1,0 +1,319 @@
+//! The report loop: results out, jobs in.
+//!
+//! One loop owns all state. It reports as soon as a job ends, and otherwise at the interval that the
+//! coordinator names; the reply may be held back while there is nothing to say, so an idle worker
+//! learns of a job at once. Jobs run as tasks and tell the loop when they begin and end.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use planesweep_plan::{NUMERICS_VERSION, WorkerId};
+use planesweep_proto::{
+    CODE_VERSION, Client, Grant, JobAttempt, Order, Outcome, PROTOCOL_VERSION, Report, ReportReply, Role,
+    ServiceError, Slots, WorkerState,
+};
+use thiserror::Error;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+use crate::device::{BackendFactory, Device};
+use crate::failure::JobError;
+use crate::held::Held;
+use crate::jobs::Jobs;
+use crate::store::{Store, StoreError};
+
+/// The first report asks for an answer at once, for it brings the store's address.
+const FIRST_WAIT: Duration = Duration::ZERO;
+/// Between reports that brought nothing although the coordinator answered at once.
+const SHORTEST_PAUSE: Duration = Duration::from_millis(20);
+/// Pauses between attempts to reach the coordinator: doubled up to the longest.
+const RECONNECT: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(2));
+
+/// What a worker is told when it starts.
+pub struct WorkerConfig {
+    /// The coordinator, such as `http://127.0.0.1:7070`.
+    pub coordinator: String,
+    /// The token, when the coordinator wants one.
+    pub token: Option<String>,
+    /// One life of this process.
+    pub id: WorkerId,
+    /// Name of this host.
+    pub host: String,
+    /// What tells hosts of one name apart.
+    pub boot_id: String,
+    /// Which jobs it takes.
+    pub role: Role,
+    /// The device it infers on, for people.
+    pub device: String,
+    /// Jobs it holds at once, by class.
+    pub slots: Slots,
+    /// Budget of images in memory, and of depth maps, each.
+    pub cache_bytes: u64,
+    /// Makes the network.
+    pub backend: BackendFactory,
+}
+
+/// Why a worker ended before its time.
+#[derive(Debug, Error)]
+pub enum WorkerError {
+    /// The coordinator refuses this worker.
+    #[error("coordinator {url} refuses this worker")]
+    Refused {
+        /// The coordinator.
+        url: String,
+        /// Why.
+        #[source]
+        source: ServiceError,
+    },
+    /// The store cannot be opened.
+    #[error("cannot reach the results")]
+    Store(#[from] StoreError),
+    /// The thread of the device cannot be started.
+    #[error("cannot start the thread of the device")]
+    Device(#[source] std::io::Error),
+}
+
+/// Works until the coordinator says stop or `stop` is cancelled; a running job is ended first, what
+/// was only queued is given back.
+pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result<(), WorkerError> {
+    let client = Client::connect(&config.coordinator, config.token.as_deref())
+        .map_err(|source| WorkerError::Refused { url: config.coordinator.clone(), source })?;
+    let device = Device::start(config.backend).map_err(WorkerError::Device)?;
+    let (events, inbox) = mpsc::channel(64);
+    let agent = Agent {
+        identity: Identity {
+            coordinator: config.coordinator,
+            worker: config.id,
+            host: config.host,
+            boot_id: config.boot_id,
+            role: config.role,
+            device: config.device,
+        },
+        client,
+        epoch: Instant::now(),
+        sequence: 0,
+        state: WorkerState::Ready,
+        held: Held::new(config.role, config.slots),
+        tasks: BTreeMap::new(),
+        events,
+        jobs: None,
+        unopened: Some((device, config.cache_bytes)),
+        max_wait: FIRST_WAIT,
+        lease_ends: None,
+    };
+    agent.run(inbox, stop).await
+}
+
+struct Identity {
+    coordinator: String,
+    worker: WorkerId,
+    host: String,
+    boot_id: String,
+    role: Role,
+    device: String,
+}
+
+enum Event {
+    Started(JobAttempt),
+    Finished(JobAttempt, Outcome),
+}
+
+struct Agent {
+    identity: Identity,
+    client: Client,
+    epoch: Instant,
+    sequence: u64,
+    state: WorkerState,
+    held: Held,
+    /// A way to give up each running job.
+    tasks: BTreeMap<JobAttempt, CancellationToken>,
+    events: mpsc::Sender<Event>,
+    /// Made with the first reply, which says where the store is.
+    jobs: Option<Arc<Jobs>>,
+    unopened: Option<(Device, u64)>,
+    max_wait: Duration,
+    lease_ends: Option<Instant>,
+}
+
+impl Agent {
+    async fn run(
+        mut self,
+        mut inbox: mpsc::Receiver<Event>,
+        stop: CancellationToken,
+    ) -> Result<(), WorkerError> {
+        let mut reconnect = RECONNECT.0;
+        loop {
+            if stop.is_cancelled() {
+                self.drain();
+            }
+            let report = self.report();
+            let sent = Instant::now();
+            let mut client = self.client.clone();
+            let answer = tokio::select! {
+                biased;
+                // A job that ends is reported at once; the report under way is dropped for it.
+                Some(event) = inbox.recv() => {
+                    self.note(event);
+                    while let Ok(event) = inbox.try_recv() {
+                        self.note(event);
+                    }
+                    continue;
+                }
+                () = stop.cancelled(), if self.state == WorkerState::Ready => continue,
+                answer = client.report(&report) => answer,
+            };
+            match answer {
+                Ok(reply) => {
+                    reconnect = RECONNECT.0;
+                    self.lease_ends = Some(sent + reply.lease);
+                    let order = reply.order;
+                    let brought_something = self.apply(reply)?;
+                    if order == Order::Stop || self.state == WorkerState::Drained {
+                        return Ok(());
+                    }
+                    if order == Order::Drain {
+                        self.drain();
+                    }
+                    if !brought_something && sent.elapsed() < SHORTEST_PAUSE {
+                        pause(SHORTEST_PAUSE, &mut inbox, &mut self).await;
+                    }
+                }
+                Err(error) if error.is_retryable() => {
+                    tracing::warn!(%error, "cannot report to the coordinator, trying again");
+                    self.end_lease_if_over();
+                    if self.state != WorkerState::Ready && self.held.held().is_empty() {
+                        // What it had is in the store; the coordinator finds out by the lease.
+                        return Ok(());
+                    }
+                    pause(reconnect, &mut inbox, &mut self).await;
+                    reconnect = (2 * reconnect).min(RECONNECT.1);
+                }
+                Err(source) => {
+                    return Err(WorkerError::Refused { url: self.identity.coordinator.clone(), source });
+                }
+            }
+        }
+    }
+
+    fn report(&mut self) -> Report {
+        self.sequence += 1;
+        if self.state == WorkerState::Draining && self.held.is_empty() {
+            self.state = WorkerState::Drained;
+        }
+        let is_ready = self.state == WorkerState::Ready;
+        Report {
+            protocol_version: PROTOCOL_VERSION,
+            code_version: CODE_VERSION.to_owned(),
+            numerics_version: NUMERICS_VERSION,
+            worker: self.identity.worker.clone(),
+            sequence: self.sequence,
+            host: self.identity.host.clone(),
+            boot_id: self.identity.boot_id.clone(),
+            role: self.identity.role,
+            device: self.identity.device.clone(),
+            state: self.state,
+            free: if is_ready && self.jobs.is_some() { self.held.free() } else { Slots::default() },
+            offset_ms: self.epoch.elapsed().as_millis() as u64,
+            held: self.held.held(),
+            finished: self.held.finished(),
+            max_wait: if self.state == WorkerState::Drained { Duration::ZERO } else { self.max_wait },
+        }
+    }
+
+    /// Does what a reply says; whether it said anything.
+    fn apply(&mut self, reply: ReportReply) -> Result<bool, WorkerError> {
+        let first = self.unopened.take();
+        let is_first = first.is_some();
+        if let Some((device, cache_bytes)) = first {
+            self.jobs = Some(Arc::new(Jobs::new(Store::open(&reply.store_url)?, device, cache_bytes)));
+        }
+        self.max_wait = reply.report_interval;
+        for attempt in &reply.revoked {
+            self.give_up(*attempt);
+        }
+        self.held.forget(reply.acknowledged.iter().chain(&reply.revoked));
+        let brought_something = is_first || !reply.grants.is_empty() || !reply.acknowledged.is_empty();
+        for grant in reply.grants {
+            if self.held.take(&grant) {
+                self.begin(grant);
+            }
+        }
+        Ok(brought_something)
+    }
+
+    fn begin(&mut self, grant: Grant) {
+        let Some(jobs) = self.jobs.clone() else { return };
+        let attempt = JobAttempt { job: grant.job, attempt: grant.attempt };
+        let cancelled = CancellationToken::new();
+        self.tasks.insert(attempt, cancelled.clone());
+        let events = self.events.clone();
+        tokio::spawn(async move {
+            let job = &grant.job.to_string()[..12];
+            let (kind, view) = (grant.spec.kind(), grant.spec.view().map(|v| v.0));
+            // The receiver lives as long as the loop; without it nobody needs to know.
+            let begun = events.clone();
+            let started = move || drop(begun.try_send(Event::Started(attempt)));
+            let outcome = match jobs.run(&grant, &cancelled, started).await {
+                Ok(success) => {
+                    tracing::debug!(job, kind, view, seconds = success.seconds, "done");
+                    Outcome::Success(success)
+                }
+                Err(error) => {
+                    let failure = error.to_failure();
+                    if !matches!(error, JobError::GivenUp) {
+                        tracing::warn!(job, kind, view, code = failure.code, "{}", failure.message);
+                    }
+                    Outcome::Failure(failure)
+                }
+            };
+            let _ = events.send(Event::Finished(attempt, outcome)).await;
+        });
+    }
+
+    fn note(&mut self, event: Event) {
+        match event {
+            Event::Started(attempt) => self.held.start(attempt),
+            Event::Finished(attempt, outcome) => {
+                self.tasks.remove(&attempt);
+                self.held.finish(attempt, outcome);
+            }
+        }
+    }
+
+    fn give_up(&mut self, attempt: JobAttempt) {
+        if let Some(cancelled) = self.tasks.remove(&attempt) {
+            cancelled.cancel();
+        }
+    }
+
+    /// Takes no more jobs and gives back those that were not begun.
+    fn drain(&mut self) {
+        if self.state == WorkerState::Ready {
+            self.state = WorkerState::Draining;
+            for attempt in self.held.not_started() {
+                self.give_up(attempt);
+            }
+        }
+    }
+
+    /// When the lease is over, queued jobs belong to somebody else. A running one goes on: if nobody
+    /// else has taken it when the coordinator is back, its result is still welcome.
+    fn end_lease_if_over(&mut self) {
+        if self.lease_ends.is_some_and(|ends| Instant::now() > ends) {
+            let lost = self.held.not_started();
+            for attempt in &lost {
+                self.give_up(*attempt);
+            }
+            self.held.forget(&lost);
+            self.lease_ends = None;
+        }
+    }
+}
+
+/// Waits, but not longer than until something happens.
+async fn pause(duration: Duration, inbox: &mut mpsc::Receiver<Event>, agent: &mut Agent) {
+    if let Ok(Some(event)) = tokio::time::timeout(duration, inbox.recv()).await {
+        agent.note(event);
+    }
+}

@@ -1,0 +1,122 @@
+//! What went wrong in a job, and what follows from it.
+
+use planesweep_fusion::EmptyCloud;
+use planesweep_mvsnet::InferError;
+use planesweep_plan::JobId;
+use planesweep_proto::Failure;
+use thiserror::Error;
+
+use crate::blob::BlobError;
+use crate::device::DeviceError;
+use crate::images::ImagesError;
+use crate::store::StoreError;
+
+/// Why a job has no result.
+#[derive(Debug, Error)]
+pub enum JobError {
+    /// An image could not be had.
+    #[error(transparent)]
+    Image(#[from] ImagesError),
+    /// The network failed.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    /// The result of a needed job could not be read.
+    #[error("cannot read the result of job {job}")]
+    Input {
+        /// The needed job.
+        job: JobId,
+        /// What the store said.
+        #[source]
+        source: StoreError,
+    },
+    /// The result of a needed job is not what it must be.
+    #[error("the result of job {job} makes no sense")]
+    Malformed {
+        /// The needed job.
+        job: JobId,
+        /// What is wrong with it.
+        #[source]
+        source: BlobError,
+    },
+    /// The weights could not be read.
+    #[error("cannot read the weights")]
+    Weights(#[source] StoreError),
+    /// The result could not be stored.
+    #[error("cannot store the result")]
+    Store(#[source] StoreError),
+    /// The depth map of the view itself failed for good.
+    #[error("there is no depth map of the view itself")]
+    NoDepthMap,
+    /// No view gave a point.
+    #[error(transparent)]
+    EmptyCloud(#[from] EmptyCloud),
+    /// The job was taken back before it was done.
+    #[error("given up: the worker is stopping or its lease is over")]
+    GivenUp,
+}
+
+impl JobError {
+    /// What the coordinator is told.
+    pub fn to_failure(&self) -> Failure {
+        let (code, retryable, counts_against_job) = match self {
+            // The bytes are fixed by their hash, so another try sees the same.
+            Self::Image(ImagesError::Read { .. }) => ("image-read", true, true),
+            Self::Image(_) => ("image", false, true),
+            Self::Device(DeviceError::Load { .. }) => ("load", false, true),
+            Self::Device(DeviceError::Infer(InferError::OutOfMemory { .. })) => ("out-of-memory", true, true),
+            Self::Device(DeviceError::Infer(InferError::Library { .. })) => ("library", true, true),
+            Self::Device(DeviceError::Infer(_)) => ("infer", false, true),
+            Self::Device(DeviceError::Gone) => ("device-gone", true, true),
+            Self::Input { source, .. } if source.is_lost() => ("input-lost", true, false),
+            Self::Malformed { .. } => ("input-malformed", true, true),
+            Self::Input { .. } | Self::Weights(_) => ("store-read", true, true),
+            Self::Store(_) => ("store-write", true, false),
+            Self::NoDepthMap => ("no-depth-map", false, true),
+            Self::EmptyCloud(_) => ("empty-cloud", false, true),
+            Self::GivenUp => ("given-up", true, false),
+        };
+        let lost_inputs = match self {
+            Self::Input { job, source } if source.is_lost() => vec![*job],
+            Self::Malformed { job, .. } => vec![*job],
+            _ => Vec::new(),
+        };
+        let code = code.to_owned();
+        Failure { code, message: with_causes(self), retryable, counts_against_job, lost_inputs }
+    }
+}
+
+/// An error with what caused it, outermost first.
+fn with_causes(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(inner) = cause {
+        text.push_str(": ");
+        text.push_str(&inner.to_string());
+        cause = inner.source();
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use planesweep_plan::BlobKey;
+
+    use super::*;
+
+    #[test]
+    fn a_lost_input_names_the_job_that_must_run_again_and_does_not_count() {
+        let job = JobId([7; 32]);
+        let error = JobError::Input { job, source: StoreError::Damaged { key: BlobKey::of(b"x") } };
+        let failure = error.to_failure();
+        assert_eq!(failure.lost_inputs, [job]);
+        assert!(failure.retryable && !failure.counts_against_job);
+        assert!(failure.message.contains("damaged"), "{}", failure.message);
+    }
+
+    #[test]
+    fn a_damaged_image_is_not_tried_again() {
+        let error = JobError::Image(ImagesError::Changed { path: "a.jpg".into() });
+        assert!(!error.to_failure().retryable);
+        assert_eq!(error.to_failure().message, "image a.jpg has changed since the run was planned");
+    }
+}

@@ -1,0 +1,115 @@
+//! Working images, decoded once for all the jobs that need them.
+
+use std::io;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use planesweep_plan::{BlobKey, ImageSpec};
+use planesweep_scene::{ImageError, PrepareError, WorkingImage, decode_image};
+use quick_cache::Weighter;
+use quick_cache::sync::Cache;
+use thiserror::Error;
+
+/// Why a working image could not be made.
+#[derive(Debug, Error)]
+pub enum ImagesError {
+    /// The file cannot be read.
+    #[error("cannot read image {}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        #[source]
+        source: io::Error,
+    },
+    /// The file is not the one that was planned with.
+    #[error("image {} has changed since the run was planned", path.display())]
+    Changed {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file is no image.
+    #[error("cannot decode view {name}")]
+    Decode {
+        /// The view.
+        name: String,
+        /// What is wrong with it.
+        #[source]
+        source: ImageError,
+    },
+    /// The image does not fit its camera.
+    #[error("cannot prepare view {name}")]
+    Prepare {
+        /// The view.
+        name: String,
+        /// What does not fit.
+        #[source]
+        source: PrepareError,
+    },
+}
+
+/// What makes two working images the same; cameras are compared by their bits.
+#[derive(Clone, PartialEq, Eq, Hash)]
+struct ImageKey {
+    file: BlobKey,
+    width: u32,
+    height: u32,
+    lens: String,
+}
+
+#[derive(Clone)]
+struct ByPixels;
+
+impl Weighter<ImageKey, Arc<WorkingImage>> for ByPixels {
+    fn weight(&self, _: &ImageKey, image: &Arc<WorkingImage>) -> u64 {
+        image.pixels.values().len() as u64 * 3
+    }
+}
+
+/// Working images within a budget of bytes.
+pub(crate) struct Images {
+    cache: Cache<ImageKey, Arc<WorkingImage>, ByPixels>,
+}
+
+impl Images {
+    pub fn new(budget_bytes: u64) -> Self {
+        let smallest_image_bytes = 1 << 18;
+        Self {
+            cache: Cache::with_weighter(
+                (budget_bytes / smallest_image_bytes).max(8) as usize,
+                budget_bytes,
+                ByPixels,
+            ),
+        }
+    }
+
+    /// The working image of a specification; several that ask for the same one wait for one of them.
+    pub async fn get(&self, spec: &ImageSpec) -> Result<Arc<WorkingImage>, ImagesError> {
+        let key = ImageKey {
+            file: spec.hash,
+            width: spec.working_width,
+            height: spec.working_height,
+            lens: format!("{:?} {:?}", spec.camera, spec.distortion),
+        };
+        let spec = spec.clone();
+        let make = async {
+            tokio::task::spawn_blocking(move || load(&spec).map(Arc::new))
+                .await
+                .expect("loading an image does not panic")
+        };
+        self.cache.get_or_insert_async(&key, make).await
+    }
+}
+
+fn load(spec: &ImageSpec) -> Result<WorkingImage, ImagesError> {
+    let path = || spec.path.clone();
+    let bytes = std::fs::read(&spec.path).map_err(|source| ImagesError::Read { path: path(), source })?;
+    if BlobKey::of(&bytes) != spec.hash {
+        return Err(ImagesError::Changed { path: path() });
+    }
+    let name = || spec.name.clone();
+    let pixels =
+        decode_image(&spec.path, &bytes).map_err(|source| ImagesError::Decode { name: name(), source })?;
+    WorkingImage::prepare(pixels, &spec.camera, &spec.distortion, spec.working_width, spec.working_height)
+        .map_err(|source| ImagesError::Prepare { name: name(), source })
+}

@@ -1,0 +1,207 @@
+//! One job from grant to stored result: load, compute, check, store.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use bytes::Bytes;
+use planesweep_fusion::{FilteredMap, Funnel, emit, encode, filter};
+use planesweep_plan::{BlobKey, FilterSpec, InferSpec, JobSpec};
+use planesweep_proto::{Grant, Input, Success};
+use planesweep_scene::DepthMap;
+use quick_cache::Weighter;
+use quick_cache::sync::Cache;
+use tokio::sync::Semaphore;
+use tokio::task::spawn_blocking;
+use tokio_util::sync::CancellationToken;
+
+use crate::blob::{
+    decode_depth_map, decode_filtered_map, decode_points, encode_depth_map, encode_filtered_map,
+    encode_points,
+};
+use crate::cloud::assemble;
+use crate::device::{Device, InferRequest};
+use crate::failure::JobError;
+use crate::images::Images;
+use crate::store::Store;
+
+#[derive(Clone)]
+struct ByPixels;
+
+impl Weighter<BlobKey, Arc<DepthMap>> for ByPixels {
+    fn weight(&self, _: &BlobKey, map: &Arc<DepthMap>) -> u64 {
+        map.depth.values().len() as u64 * 11
+    }
+}
+
+/// All that jobs share on a worker.
+pub(crate) struct Jobs {
+    store: Store,
+    images: Images,
+    device: Device,
+    /// One inference at a time; the next one loads its images meanwhile.
+    device_turn: Semaphore,
+    maps: Cache<BlobKey, Arc<DepthMap>, ByPixels>,
+}
+
+/// The bytes of a result and what was measured on the way.
+type Made = (Vec<u8>, BTreeMap<String, f64>);
+
+impl Jobs {
+    /// `cache_bytes` is the budget of images in memory, and of depth maps, each.
+    pub fn new(store: Store, device: Device, cache_bytes: u64) -> Self {
+        let smallest_map_bytes = 1 << 16;
+        let maps = (cache_bytes / smallest_map_bytes).max(16) as usize;
+        Self {
+            store,
+            images: Images::new(cache_bytes),
+            device,
+            device_turn: Semaphore::new(1),
+            maps: Cache::with_weighter(maps, cache_bytes, ByPixels),
+        }
+    }
+
+    /// Does a job. `started` is called when computing begins; a job cancelled before its result is
+    /// stored has none.
+    pub async fn run(
+        &self,
+        grant: &Grant,
+        cancelled: &CancellationToken,
+        started: impl FnOnce(),
+    ) -> Result<Success, JobError> {
+        let begun = Instant::now();
+        let (bytes, measurements) = match &grant.spec {
+            JobSpec::Infer(spec) => self.infer(spec, cancelled, started).await?,
+            JobSpec::Filter(spec) => {
+                started();
+                self.filter(spec, &grant.inputs).await?
+            }
+            JobSpec::Emit(_) => {
+                started();
+                self.emit(&grant.inputs).await?
+            }
+            JobSpec::Assemble(_) => {
+                started();
+                self.assemble(&grant.inputs).await?
+            }
+        };
+        check(cancelled)?;
+        let length = bytes.len() as u64;
+        let blob = self.store.put(bytes.into()).await.map_err(JobError::Store)?;
+        Ok(Success { blob, length, measurements, seconds: begun.elapsed().as_secs_f64() })
+    }
+
+    async fn infer(
+        &self,
+        spec: &InferSpec,
+        cancelled: &CancellationToken,
+        started: impl FnOnce(),
+    ) -> Result<Made, JobError> {
+        check(cancelled)?;
+        let weights = self.store.get(&spec.weights).await.map_err(JobError::Weights)?;
+        let reference = self.images.get(&spec.reference).await?;
+        let mut sources = Vec::with_capacity(spec.sources.len());
+        for source in &spec.sources {
+            sources.push(self.images.get(source).await?);
+        }
+        let turn = self.device_turn.acquire().await;
+        check(cancelled)?;
+        started();
+        let begun = Instant::now();
+        let request = InferRequest {
+            weights: (spec.weights, weights),
+            threads: spec.threads,
+            reference,
+            sources,
+            hypotheses: spec.hypotheses,
+        };
+        let map = self.device.infer(request).await?;
+        drop(turn);
+        let confident = map.confidence.values().iter().filter(|c| **c > 0.8).count();
+        let measurements = BTreeMap::from([
+            ("network_seconds".to_owned(), begun.elapsed().as_secs_f64()),
+            ("confident_share".to_owned(), confident as f64 / map.confidence.values().len() as f64),
+        ]);
+        let map = Arc::new(map);
+        let bytes = encode_depth_map(&map);
+        // Neighbouring views filter against this map soon: keep it.
+        self.maps.insert(BlobKey::of(&bytes), map);
+        Ok((bytes, measurements))
+    }
+
+    async fn filter(&self, spec: &FilterSpec, inputs: &[Input]) -> Result<Made, JobError> {
+        let (own, others) = inputs.split_first().ok_or(JobError::NoDepthMap)?;
+        let reference = self.depth_map(own).await?.ok_or(JobError::NoDepthMap)?;
+        let mut neighbours = Vec::with_capacity(others.len());
+        for input in others {
+            neighbours.extend(self.depth_map(input).await?);
+        }
+        let options = spec.options;
+        let filtered = compute(move || {
+            let neighbours: Vec<&DepthMap> = neighbours.iter().map(AsRef::as_ref).collect();
+            filter(&reference, &neighbours, &options)
+        })
+        .await;
+        let Funnel { pixels, with_depth, photometric, geometric } = filtered.funnel;
+        let counts = [
+            ("pixels", pixels),
+            ("with_depth", with_depth),
+            ("photometric", photometric),
+            ("geometric", geometric),
+        ];
+        let measurements = counts.map(|(name, count)| (name.to_owned(), count as f64)).into();
+        Ok((encode_filtered_map(&filtered), measurements))
+    }
+
+    async fn emit(&self, inputs: &[Input]) -> Result<Made, JobError> {
+        let own = inputs.first().ok_or(JobError::NoDepthMap)?;
+        let bytes = self.input(own).await?.ok_or(JobError::NoDepthMap)?;
+        let map: FilteredMap =
+            decode_filtered_map(&bytes).map_err(|source| JobError::Malformed { job: own.job, source })?;
+        let points = compute(move || encode_points(&map.funnel, &encode(&emit(&map)))).await;
+        let count =
+            decode_points(&points).map_err(|source| JobError::Malformed { job: own.job, source })?.len();
+        Ok((points, BTreeMap::from([("points".to_owned(), count as f64)])))
+    }
+
+    async fn assemble(&self, inputs: &[Input]) -> Result<Made, JobError> {
+        let mut clouds = Vec::with_capacity(inputs.len());
+        for input in inputs {
+            if let Some(bytes) = self.input(input).await? {
+                clouds.push((input.job, bytes));
+            }
+        }
+        compute(move || {
+            let (bytes, points) = assemble(&clouds)?;
+            Ok((bytes, BTreeMap::from([("points".to_owned(), points as f64)])))
+        })
+        .await
+    }
+
+    /// The result of a needed job; `None` when that job failed for good.
+    async fn input(&self, input: &Input) -> Result<Option<Bytes>, JobError> {
+        let Some(produced) = &input.produced else { return Ok(None) };
+        let read = self.store.get(&produced.blob).await;
+        read.map(Some).map_err(|source| JobError::Input { job: input.job, source })
+    }
+
+    async fn depth_map(&self, input: &Input) -> Result<Option<Arc<DepthMap>>, JobError> {
+        let Some(produced) = &input.produced else { return Ok(None) };
+        let read = async {
+            let bytes = self.input(input).await?.unwrap_or_default();
+            let map =
+                decode_depth_map(&bytes).map_err(|source| JobError::Malformed { job: input.job, source })?;
+            Ok(Arc::new(map))
+        };
+        self.maps.get_or_insert_async(&produced.blob, read).await.map(Some)
+    }
+}
+
+fn check(cancelled: &CancellationToken) -> Result<(), JobError> {
+    if cancelled.is_cancelled() { Err(JobError::GivenUp) } else { Ok(()) }
+}
+
+/// Runs something long outside the threads that keep the heartbeat going.
+async fn compute<T: Send + 'static>(f: impl FnOnce() -> T + Send + 'static) -> T {
+    spawn_blocking(f).await.expect("computing does not panic")
+}
