@@ -1,1 +1,21 @@
-//! What a person sees of a run: previews, report.json and report.html.
+//! What a person sees of a run: a preview per view, a picture of the cloud, `report.json` and a
+//! self-contained `report.html`.
+//!
+//! All of it is computed from plain values and returned as values; writing files is the caller's.
+
+#![warn(missing_docs)]
+
+mod cloud_picture;
+mod colormap;
+mod font;
+mod html;
+mod picture;
+mod preview;
+mod run_report;
+
+pub use cloud_picture::render_cloud;
+pub use colormap::{confidence_color, depth_color};
+pub use html::{Pictures, render_html};
+pub use picture::{PictureError, encode_png};
+pub use preview::{PreviewError, PreviewOptions, draw_preview};
+pub use run_report::{Funnel, RunReport, SkippedView, StageReport, Totals, ViewReport};
