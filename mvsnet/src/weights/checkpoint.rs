@@ -95,9 +95,10 @@ fn read_legacy(bytes: &[u8]) -> Result<(Pickle, Storages<'_>), CheckpointError> 
         Ok(pickle)
     };
     let not = |what| CheckpointError::NotACheckpoint { what };
-    // Any other file fails here; its first bytes are no news to anybody.
-    if next().map_or(true, |magic| magic.root != Value::Int(LEGACY_MAGIC)) {
-        return Err(not("neither a zip archive nor the older format's magic number"));
+    match next() {
+        Ok(magic) if magic.root == Value::Int(LEGACY_MAGIC) => {}
+        Err(code @ PickleError::Forbidden { .. }) => return Err(code.into()),
+        _ => return Err(not("neither a zip archive nor the older format's magic number")),
     }
     if next()?.root != Value::Int(LEGACY_PROTOCOL) {
         return Err(not("the protocol is not 1001"));
@@ -155,8 +156,13 @@ fn read_zip(bytes: &[u8]) -> Result<(Pickle, Storages<'_>), CheckpointError> {
     }
     let object = Pickle::read(&entry("data.pkl", None)?)?;
     let mut storages = Storages::new();
+    let mut left = bytes.len();
     for (key, storage) in &object.storages {
-        let elements = entry(&format!("data/{key}"), Some(storage_bytes(key, *storage)?))?;
+        let expected = storage_bytes(key, *storage)?;
+        // Entries of a hostile archive may share bytes, so that all together are larger than the file.
+        let cut = || CheckpointError::Storage { key: key.to_string(), expected };
+        left = left.checked_sub(expected).ok_or_else(cut)?;
+        let elements = entry(&format!("data/{key}"), Some(expected))?;
         storages.insert(key.to_string(), elements.into());
     }
     Ok((object, storages))
@@ -281,5 +287,7 @@ mod tests {
         assert!(matches!(read(b"\x89PNG\r\n"), Err(CheckpointError::NotACheckpoint { .. })));
         assert!(matches!(read(b""), Err(CheckpointError::NotACheckpoint { .. })));
         assert!(matches!(read(b"PK\x03\x04"), Err(CheckpointError::Zip(_))));
+        let code = read(b"\x80\x02cposix\nsystem\n.");
+        assert!(matches!(code, Err(CheckpointError::Pickle(PickleError::Forbidden { .. }))));
     }
 }
