@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder, ImageError};
-use planesweep_scene::{Distortion, PfmError, Raster, Scene, View, ViewId, write_atomically, write_pfm};
+use planesweep_scene::{
+    Distortion, PfmError, Raster, Scene, View, ViewId, WriteError, write_atomically, write_colmap, write_pfm,
+};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -62,6 +64,15 @@ pub enum DemoError {
         #[source]
         source: io::Error,
     },
+    /// The COLMAP model could not be written.
+    #[error("cannot write the COLMAP model of {}", out.display())]
+    WriteModel {
+        /// The demo's folder.
+        out: PathBuf,
+        /// Why.
+        #[source]
+        source: WriteError,
+    },
     /// A depth map could not be written.
     #[error("cannot write the true depth of view {view}")]
     WriteDepth {
@@ -73,8 +84,9 @@ pub enum DemoError {
     },
 }
 
-/// Renders a scene and writes `images/NAME.png` and `depth_gt/NAME.pfm` (exact depth at image size)
-/// into `out`. Returns the scene, whose image paths lie in `out`.
+/// Renders a scene and writes it into `out`: `images/NAME.png` and their COLMAP model, and
+/// `depth_gt/NAME.pfm`, the exact depth at image size. The model comes last, so where it is, all is.
+/// Returns the scene, whose image paths lie in `out`.
 pub fn write_demo(out: &Path, options: &DemoOptions) -> Result<Scene, DemoError> {
     let (images, depths) = (out.join("images"), out.join("depth_gt"));
     for folder in [&images, &depths] {
@@ -100,7 +112,9 @@ pub fn write_demo(out: &Path, options: &DemoOptions) -> Result<Scene, DemoError>
         })
         .collect::<Result<_, DemoError>>()?;
     let points = synth.sparse_points(synth.cameras(), options.points_per_view);
-    Ok(Scene { views, points, ..Scene::default() })
+    let scene = Scene { views, points, ..Scene::default() };
+    write_colmap(&scene, out).map_err(|source| DemoError::WriteModel { out: out.to_owned(), source })?;
+    Ok(scene)
 }
 
 fn write_png(path: &Path, image: &Raster<[u8; 3]>) -> Result<(), DemoError> {
@@ -118,7 +132,7 @@ fn write_png(path: &Path, image: &Raster<[u8; 3]>) -> Result<(), DemoError> {
 
 #[cfg(test)]
 mod tests {
-    use planesweep_scene::read_depth_pfm;
+    use planesweep_scene::{ReadOptions, read_depth_pfm, read_scene};
 
     use super::*;
 
@@ -130,10 +144,14 @@ mod tests {
         let scene = write_demo(folder.path(), &options).expect("written");
         assert_eq!(scene.views.len(), 3);
         assert!(scene.points.len() > 60, "{} points", scene.points.len());
+        let read = read_scene(folder.path(), &ReadOptions::default()).expect("a COLMAP model");
+        assert_eq!((read.views.len(), read.points.len()), (3, scene.points.len()));
         let synth = SynthScene::new(options.seed, &style);
         for (view, camera) in scene.views.values().zip(synth.cameras()) {
             let (color, depth) = synth.render(camera, 1);
             let stored = image::open(&view.image).expect("a PNG").to_rgb8();
+            let ours = camera.projection() - read.views[&view.id].camera.projection();
+            assert!(ours.amax() < 1e-9, "the camera changed by {}", ours.amax());
             assert_eq!(stored.as_raw(), color.values().as_flattened());
             let path = folder.path().join("depth_gt").join(&view.name).with_extension("pfm");
             assert_eq!(read_depth_pfm(&path).expect("a PFM"), depth);

@@ -2,7 +2,7 @@
 //!
 //! A [`SynthScene`] follows from a seed: bodies with procedural textures, a sun, cameras around
 //! them. It renders images with exact depth from any camera, and samples sparse points with tracks
-//! as structure from motion would find them. [`write_demo`] lays one down on disk.
+//! as structure from motion would find them. [`write_demo`] writes one as a COLMAP model.
 
 #![warn(missing_docs)]
 
