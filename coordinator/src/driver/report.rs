@@ -1,0 +1,225 @@
+//! Reports: recorded at once, answered at once or as soon as there is something to say.
+
+use planesweep_plan::WorkerId;
+use planesweep_proto::{
+    Code, Grant, Input, JobAttempt, Order, Outcome, Report, ReportReply, ServiceError, WorkerState,
+};
+
+use super::carry_out::Payload;
+use super::message::Reply;
+use super::{Driver, WorkerInfo};
+use crate::ledger::{LedgerError, Step};
+use crate::schedule::{Command, Ending, Event, Finished, FreeSlots, Held, Timestamp, decide};
+
+/// A report whose reply is held back.
+pub(super) struct Parked {
+    free: FreeSlots,
+    until: Timestamp,
+    answer: ReportReply,
+    reply: Reply<Result<ReportReply, ServiceError>>,
+}
+
+impl Driver {
+    pub(super) async fn report(&mut self, report: Report, reply: Reply<Result<ReportReply, ServiceError>>) {
+        let now = self.now();
+        if let Some(last) = self.workers.get(&report.worker).filter(|info| info.sequence >= report.sequence) {
+            let text =
+                format!("report {} of {} came after {}", report.sequence, report.worker, last.sequence);
+            let _ = reply.send(Err(ServiceError::new(Code::Superseded, text)));
+            return;
+        }
+        if let Some(older) = self.parked.remove(&report.worker) {
+            let _ = older.reply.send(Ok(older.answer));
+        }
+        self.workers.insert(
+            report.worker.clone(),
+            WorkerInfo {
+                host: report.host.clone(),
+                role: report.role,
+                device: report.device.clone(),
+                state: report.state,
+                last_report: now,
+                sequence: report.sequence,
+            },
+        );
+        let answer = match self.record(&report, now).await {
+            Ok(answer) => answer,
+            Err(error) => {
+                let _ = reply.send(Err(self.recover(&error).await));
+                return;
+            }
+        };
+        self.note_workers(now);
+        let wait = report.max_wait.min(self.settings.report_interval).as_millis() as u64;
+        let nothing_to_say = answer.grants.is_empty()
+            && answer.revoked.is_empty()
+            && answer.acknowledged.is_empty()
+            && answer.order == Order::Work;
+        if nothing_to_say && wait > 0 && report.state == WorkerState::Ready {
+            let parked = Parked { free: slots(&report), until: now.plus(wait), answer, reply };
+            self.parked.insert(report.worker, parked);
+        } else {
+            self.send(&report.worker, answer, reply);
+        }
+    }
+
+    /// One step: the report's results and leases, then new jobs.
+    async fn record(&mut self, report: &Report, now: Timestamp) -> Result<ReportReply, LedgerError> {
+        let event = Event::Reported {
+            worker: report.worker.clone(),
+            ready: report.state == WorkerState::Ready,
+            held: report
+                .held
+                .iter()
+                .map(|held| Held { job: held.job, attempt: held.attempt, started: held.started })
+                .collect(),
+            finished: report
+                .finished
+                .iter()
+                .map(|finished| Finished {
+                    job: finished.job,
+                    attempt: finished.attempt,
+                    ending: ending(&finished.outcome),
+                })
+                .collect(),
+        };
+        let outcomes = report.finished.iter().map(|f| ((f.job, f.attempt), &f.outcome)).collect();
+        let payload = Payload { outcomes, ..Payload::default() };
+        let commands = decide(&self.snapshot, event, now);
+        let wants = Event::WantsWork { worker: report.worker.clone(), free: slots(report) };
+
+        let mut answer = self.empty_answer(report.offset_ms);
+        for command in &commands {
+            match *command {
+                Command::Revoke { job, attempt } => answer.revoked.push(JobAttempt { job, attempt }),
+                Command::Acknowledge { job, attempt } => {
+                    answer.acknowledged.push(JobAttempt { job, attempt });
+                }
+                _ => {}
+            }
+        }
+        // A heartbeat with nothing in hand and nothing to be had costs the ledger nothing.
+        if commands.iter().all(|command| matches!(command, Command::Admit { .. })) {
+            for command in &commands {
+                self.snapshot.apply(command, now);
+            }
+            if self.order == Order::Work {
+                answer.grants = self.grant_alone(wants, now).await?;
+            }
+            return Ok(answer);
+        }
+        let mut step = self.ledger.begin().await?;
+        self.carry_out(&mut step, &commands, &payload, now).await?;
+        if self.order == Order::Work {
+            answer.grants = self.grant(&mut step, wants, now).await?;
+        }
+        self.commit(step).await?;
+        Ok(answer)
+    }
+
+    async fn grant(
+        &mut self,
+        step: &mut Step,
+        wants: Event,
+        now: Timestamp,
+    ) -> Result<Vec<Grant>, LedgerError> {
+        let commands = decide(&self.snapshot, wants, now);
+        let mut grants = Vec::new();
+        for command in self.carry_out(step, &commands, &Payload::default(), now).await? {
+            let Command::Grant { job: id, attempt, .. } = command else { continue };
+            let job = step.job(&id).await?;
+            let input = |need| Input { job: need, produced: self.results.get(&need).cloned() };
+            let inputs = job.needs.into_iter().map(input).collect();
+            grants.push(Grant { job: id, attempt, spec: job.spec, inputs });
+        }
+        Ok(grants)
+    }
+
+    /// Looks whether there is something to say now to those who wait.
+    pub(super) async fn serve_parked(&mut self) {
+        let now = self.now();
+        let may_grant = self.order == Order::Work && self.snapshot.has_ready();
+        let waiting: Vec<WorkerId> = self
+            .parked
+            .iter()
+            .filter(|(_, parked)| {
+                may_grant || self.order != Order::Work || parked.until <= now || parked.reply.is_closed()
+            })
+            .map(|(worker, _)| worker.clone())
+            .collect();
+        for worker in waiting {
+            let Some(mut parked) = self.parked.remove(&worker) else { continue };
+            if parked.reply.is_closed() {
+                continue;
+            }
+            if may_grant {
+                let wants = Event::WantsWork { worker: worker.clone(), free: parked.free };
+                match self.grant_alone(wants, now).await {
+                    Ok(grants) => parked.answer.grants = grants,
+                    Err(error) => {
+                        let _ = parked.reply.send(Err(self.recover(&error).await));
+                        continue;
+                    }
+                }
+            }
+            if parked.answer.grants.is_empty() && self.order == Order::Work && parked.until > now {
+                self.parked.insert(worker, parked);
+            } else {
+                self.send(&worker, parked.answer, parked.reply);
+            }
+        }
+    }
+
+    async fn grant_alone(&mut self, wants: Event, now: Timestamp) -> Result<Vec<Grant>, LedgerError> {
+        if decide(&self.snapshot, wants.clone(), now).is_empty() {
+            return Ok(Vec::new());
+        }
+        let mut step = self.ledger.begin().await?;
+        let grants = self.grant(&mut step, wants, now).await?;
+        self.commit(step).await?;
+        Ok(grants)
+    }
+
+    fn send(
+        &mut self,
+        worker: &WorkerId,
+        mut answer: ReportReply,
+        reply: Reply<Result<ReportReply, ServiceError>>,
+    ) {
+        answer.order = self.order;
+        if self.order == Order::Stop {
+            self.told_to_stop.insert(worker.clone());
+        }
+        // A caller that has gone meanwhile does not speak of these grants in its next report, so
+        // they are taken back then.
+        let _ = reply.send(Ok(answer));
+    }
+
+    fn empty_answer(&self, offset_ms: u64) -> ReportReply {
+        ReportReply {
+            offset_ms,
+            lease: self.settings.lease,
+            report_interval: self.settings.report_interval,
+            grants: Vec::new(),
+            revoked: Vec::new(),
+            acknowledged: Vec::new(),
+            store_url: self.settings.store_url.clone(),
+            order: self.order,
+        }
+    }
+}
+
+fn slots(report: &Report) -> FreeSlots {
+    FreeSlots { infer: report.free.infer, fuse: report.free.fuse }
+}
+
+fn ending(outcome: &Outcome) -> Ending {
+    match outcome {
+        Outcome::Success(_) => Ending::Success,
+        Outcome::Failure(failure) => Ending::Failure {
+            retryable: failure.retryable,
+            counts: failure.counts_against_job,
+            lost: failure.lost_inputs.clone(),
+        },
+    }
+}

@@ -1,0 +1,223 @@
+//! What is read from the ledger.
+
+use std::collections::BTreeMap;
+
+use planesweep_plan::{Attempt, BlobKey, JobId, RunId, WorkerId};
+use planesweep_proto::{JobResult, JobState, Produced};
+use planesweep_scene::ViewId;
+use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqlitePool};
+
+use super::{Ledger, LedgerError};
+use crate::schedule::{Class, JobRecord, JobShape, LedgerState};
+
+/// Failures and ended jobs listed in one status.
+const LISTED: i64 = 500;
+
+/// The columns that [`result`] reads; `LEFT JOIN`ed nowhere, so all are of `jobs`.
+macro_rules! select_results {
+    ($rest:literal) => {
+        concat!(
+            "SELECT jobs.id, kind, view, state, attempt, ended, blob, blob_length, measurements, seconds, worker, \
+             failure_code, failure, position ",
+            $rest
+        )
+    };
+}
+
+/// A run as the ledger knows it.
+#[derive(Debug)]
+pub(crate) struct RunRow {
+    pub name: String,
+    pub cancelled: bool,
+    pub counts: BTreeMap<(String, JobState), u64>,
+    pub failures: Vec<JobResult>,
+    pub recent: Vec<JobResult>,
+}
+
+impl Ledger {
+    /// How far a run is, with the jobs that ended after `after`.
+    pub(crate) async fn run(&self, run: &RunId, after: u64) -> Result<RunRow, LedgerError> {
+        let failed = LedgerError::statement("read a run");
+        let (number, name, cancelled) = self.find(run).await?;
+        let rows = sqlx::query(
+            "SELECT kind, state, COUNT(*) AS jobs FROM run_jobs JOIN jobs ON jobs.position = run_jobs.job
+             WHERE run = $1 GROUP BY kind, state",
+        )
+        .bind(number)
+        .fetch_all(&self.pool)
+        .await
+        .map_err(&failed)?;
+        let mut counts = BTreeMap::new();
+        for row in rows {
+            let jobs: i64 = get(&row, "jobs")?;
+            counts.insert((get(&row, "kind")?, state(&row)?), jobs as u64);
+        }
+        let failures = sqlx::query(select_results!(
+            "FROM jobs JOIN run_jobs ON jobs.position = run_jobs.job
+             WHERE state = 'failed' AND run = $1 ORDER BY seq LIMIT $2"
+        ));
+        let failures = failures.bind(number).bind(LISTED).fetch_all(&self.pool).await.map_err(&failed)?;
+        let recent = sqlx::query(select_results!(
+            "FROM jobs WHERE ended > $2
+             AND EXISTS (SELECT 1 FROM run_jobs WHERE run_jobs.job = jobs.position AND run = $1)
+             ORDER BY ended LIMIT $3"
+        ));
+        let recent = recent.bind(number).bind(after as i64).bind(LISTED);
+        let recent = recent.fetch_all(&self.pool).await.map_err(&failed)?;
+        Ok(RunRow {
+            name,
+            cancelled,
+            counts,
+            failures: failures.iter().map(result).collect::<Result<_, _>>()?,
+            recent: recent.iter().map(result).collect::<Result<_, _>>()?,
+        })
+    }
+
+    /// Up to `limit` jobs of a run in plan order, from place `from` on.
+    pub(crate) async fn results(
+        &self,
+        run: &RunId,
+        from: usize,
+        limit: usize,
+    ) -> Result<Vec<JobResult>, LedgerError> {
+        let (number, ..) = self.find(run).await?;
+        let query = sqlx::query(select_results!(
+            "FROM run_jobs JOIN jobs ON jobs.position = run_jobs.job
+             WHERE run = $1 AND seq >= $2 ORDER BY seq LIMIT $3"
+        ));
+        let query = query.bind(number).bind(from as i64).bind(limit as i64);
+        let rows = query.fetch_all(&self.pool).await.map_err(LedgerError::statement("read results"))?;
+        rows.iter().map(result).collect()
+    }
+
+    /// Whether every job of a run ended, or the run was cancelled.
+    pub(crate) async fn is_finished(&self, run: &RunId) -> Result<bool, LedgerError> {
+        let (number, _, cancelled) = self.find(run).await?;
+        // Starts from the jobs to be done, so that it is quick at the end, when it is asked most.
+        let unfinished: bool = sqlx::query_scalar(
+            "SELECT EXISTS (SELECT 1 FROM jobs JOIN run_jobs ON run_jobs.job = jobs.position
+                            WHERE state IN ('open', 'leased') AND run = $1)",
+        )
+        .bind(number)
+        .fetch_one(&self.pool)
+        .await
+        .map_err(LedgerError::statement("look for unfinished jobs"))?;
+        Ok(cancelled || !unfinished)
+    }
+
+    async fn find(&self, run: &RunId) -> Result<(i64, String, bool), LedgerError> {
+        sqlx::query_as("SELECT number, name, cancelled FROM runs WHERE id = $1")
+            .bind(&run.0)
+            .fetch_optional(&self.pool)
+            .await
+            .map_err(LedgerError::statement("find a run"))?
+            .ok_or_else(|| LedgerError::NoSuchRun { run: run.clone() })
+    }
+}
+
+pub(super) async fn records(pool: &SqlitePool) -> Result<Vec<JobRecord>, LedgerError> {
+    let rows = sqlx::query(
+        "SELECT id, kind, needs, state, worker, attempt, failures, suspect, deaths_alone, outdated
+         FROM jobs ORDER BY position",
+    )
+    .fetch_all(pool)
+    .await
+    .map_err(LedgerError::statement("load jobs"))?;
+    rows.iter().map(record).collect()
+}
+
+fn record(row: &SqliteRow) -> Result<JobRecord, LedgerError> {
+    let kind: String = get(row, "kind")?;
+    let needs: Vec<u8> = get(row, "needs")?;
+    let needs = needs.chunks(32).map(|hash| job_id(hash.to_vec())).collect::<Result<_, _>>()?;
+    let state = match state(row)? {
+        JobState::Open => LedgerState::Open,
+        JobState::Leased => LedgerState::Leased(WorkerId(get(row, "worker")?)),
+        JobState::Done => LedgerState::Done,
+        JobState::Failed => LedgerState::Failed,
+        JobState::Cancelled => LedgerState::Cancelled,
+    };
+    Ok(JobRecord {
+        shape: JobShape { id: job_id(get(row, "id")?)?, class: Class::of(&kind), needs },
+        state,
+        attempt: Attempt(get(row, "attempt")?),
+        failures: get(row, "failures")?,
+        suspect: get(row, "suspect")?,
+        deaths_alone: get(row, "deaths_alone")?,
+        outdated: get(row, "outdated")?,
+    })
+}
+
+pub(super) async fn produced(pool: &SqlitePool) -> Result<Vec<(JobId, Produced)>, LedgerError> {
+    let rows = sqlx::query("SELECT id, blob, blob_length, worker FROM jobs WHERE state = 'done'")
+        .fetch_all(pool)
+        .await
+        .map_err(LedgerError::statement("load results"))?;
+    rows.iter()
+        .map(|row| {
+            let (blob, length): (Vec<u8>, i64) = (get(row, "blob")?, get(row, "blob_length")?);
+            let worker = WorkerId(get(row, "worker")?);
+            Ok((
+                job_id(get(row, "id")?)?,
+                Produced { blob: BlobKey(hash("blob", blob)?), length: length as u64, worker },
+            ))
+        })
+        .collect()
+}
+
+fn result(row: &SqliteRow) -> Result<JobResult, LedgerError> {
+    let view: Option<i64> = get(row, "view")?;
+    let blob: Option<Vec<u8>> = get(row, "blob")?;
+    let length: Option<i64> = get(row, "blob_length")?;
+    let blob = match (blob, length) {
+        (Some(key), Some(length)) => Some((BlobKey(hash("blob", key)?), length as u64)),
+        _ => None,
+    };
+    let measurements: Option<String> = get(row, "measurements")?;
+    let measurements = match measurements {
+        None => BTreeMap::new(),
+        Some(json) => serde_json::from_str(&json)
+            .map_err(|_| LedgerError::Damaged { what: "measurements", found: json })?,
+    };
+    let code: Option<String> = get(row, "failure_code")?;
+    let message: Option<String> = get(row, "failure")?;
+    let worker: Option<String> = get(row, "worker")?;
+    let ended: i64 = get(row, "ended")?;
+    Ok(JobResult {
+        job: job_id(get(row, "id")?)?,
+        kind: get(row, "kind")?,
+        view: view.map(|id| ViewId(id as u32)),
+        state: state(row)?,
+        attempt: Attempt(get(row, "attempt")?),
+        ended: ended as u64,
+        blob,
+        measurements,
+        seconds: get(row, "seconds")?,
+        worker: worker.map(WorkerId),
+        failure: code.zip(message),
+    })
+}
+
+fn get<'r, T>(row: &'r SqliteRow, column: &str) -> Result<T, LedgerError>
+where
+    T: sqlx::Decode<'r, sqlx::Sqlite> + sqlx::Type<sqlx::Sqlite>,
+{
+    row.try_get(column).map_err(LedgerError::statement("read a column"))
+}
+
+fn state(row: &SqliteRow) -> Result<JobState, LedgerError> {
+    let name: String = get(row, "state")?;
+    JobState::from_name(&name).ok_or(LedgerError::Damaged { what: "state", found: name })
+}
+
+pub(super) fn job_id(bytes: Vec<u8>) -> Result<JobId, LedgerError> {
+    hash("id", bytes).map(JobId)
+}
+
+fn hash(what: &'static str, bytes: Vec<u8>) -> Result<[u8; 32], LedgerError> {
+    bytes.try_into().map_err(|bytes: Vec<u8>| LedgerError::Damaged {
+        what,
+        found: format!("{} bytes instead of 32", bytes.len()),
+    })
+}

@@ -1,0 +1,62 @@
+//! Who does what, when: decisions only. No I/O, no clock, nothing random.
+//!
+//! | the driver does | this module decides |
+//! | --- | --- |
+//! | receives reports, submissions and ticks, reads the clock | [`decide`]: what follows from an event |
+//! | carries out each command as a conditional SQL statement | nothing: the command leaves no choice |
+//! | [`Snapshot::apply`]s those that changed a row, drops the others | how the snapshot changes |
+//!
+//! A job lives like this; *open* is one state in the ledger, and what kind of open follows from
+//! the jobs it needs and from the time:
+//!
+//! ```text
+//!            ┌────────────── open ──────────────┐
+//!  submit ──>│ waiting ──> ready <── delayed     │──cancel──> cancelled
+//!            └───▲──────────┬─────────▲─────────┘               │ submit again: open
+//!     release,   │          │ grant   │ retry
+//!     suspect    │          ▼         │
+//!                └──────  leased ─────┘──give up──> failed ── submit again: open
+//!                           │
+//!                           └──complete──> done ── result lost, new input: open
+//! ```
+//!
+//! Invariants, tested with random histories:
+//!
+//! - A job has one lease at most, and none when it is done, failed or cancelled.
+//! - Each grant has a higher attempt than all before it; only the attempt that holds the lease can
+//!   complete or fail the job, so each effect happens once.
+//! - A job is granted only when each job it needs is done or failed for good.
+//! - A job fails for good by itself, after [`MAX_FAILURES`] failures that count, or after
+//!   [`MAX_DEATHS_ALONE`] deaths of workers that held nothing else; not by anything else.
+//! - While a worker that takes its class lives and reports, every job ends.
+
+mod assign;
+mod event;
+mod lease;
+mod report;
+mod state;
+mod submit;
+
+pub use event::{Class, Command, Ending, Event, Finished, FreeSlots, Held, JobShape, Reopening, Timestamp};
+pub use state::{JobRecord, LedgerState, Snapshot};
+pub use submit::{OrderError, check_order};
+
+/// Failures that count against a job before it fails for good.
+pub const MAX_FAILURES: u32 = 3;
+
+/// Deaths of workers running a job alone before it is quarantined.
+pub const MAX_DEATHS_ALONE: u32 = 3;
+
+/// What follows from an event.
+pub fn decide(snapshot: &Snapshot, event: Event, now: Timestamp) -> Vec<Command> {
+    match event {
+        Event::Submitted { jobs } => submit::submitted(snapshot, jobs),
+        Event::Reported { worker, ready, held, finished } => {
+            report::reported(snapshot, &worker, ready, &held, &finished, now)
+        }
+        Event::WantsWork { worker, free } => assign::wants_work(snapshot, &worker, free, now),
+        Event::Tick => lease::tick(snapshot, now),
+        Event::Cancelled { jobs } => submit::cancelled(snapshot, &jobs),
+        Event::ResultsLost { jobs } => submit::results_lost(snapshot, &jobs),
+    }
+}

@@ -1,0 +1,449 @@
+//! What scheduling knows, and how commands change it.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use planesweep_plan::{Attempt, JobId, WorkerId};
+
+use super::{Class, Command, JobShape, Reopening, Timestamp};
+
+/// A job's place in the order of all jobs; jobs refer to each other by it, because a hash for every
+/// edge of a graph of 100 000 views would fill hundreds of megabytes.
+pub(super) type Ordinal = u32;
+
+/// Where a job stands in the ledger.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum LedgerState {
+    /// To be done.
+    Open,
+    /// In the hands of a worker.
+    Leased(WorkerId),
+    /// Done.
+    Done,
+    /// Failed for good.
+    Failed,
+    /// No longer wanted.
+    Cancelled,
+}
+
+/// A job as the ledger keeps it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct JobRecord {
+    /// Id, class and needs.
+    pub shape: JobShape,
+    /// Where it stands.
+    pub state: LedgerState,
+    /// The latest try; 0 when there was none.
+    pub attempt: Attempt,
+    /// Failures that count against it.
+    pub failures: u32,
+    /// Whether a worker died while it was running.
+    pub suspect: bool,
+    /// Deaths of workers that ran nothing else.
+    pub deaths_alone: u32,
+    /// Whether jobs that need it may have ended without its (newest) result.
+    pub outdated: bool,
+}
+
+/// A job within the snapshot.
+#[derive(Clone, Debug)]
+pub(super) struct Job {
+    pub id: JobId,
+    pub class: Class,
+    pub needs: Box<[Ordinal]>,
+    pub dependents: Vec<Ordinal>,
+    pub state: State,
+    pub attempt: Attempt,
+    pub failures: u32,
+    pub suspect: bool,
+    pub deaths_alone: u32,
+    pub outdated: bool,
+}
+
+/// Where a job stands; fields exist only in the states that have them.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum State {
+    /// Ready when `unmet`, the number of needed jobs that have not ended, is 0 and the time has come.
+    Open {
+        unmet: u32,
+        not_before: Timestamp,
+    },
+    Leased {
+        worker: WorkerId,
+        started: bool,
+    },
+    Done,
+    Failed,
+    Cancelled,
+}
+
+impl State {
+    /// Whether jobs that need this one may run.
+    fn has_ended(&self) -> bool {
+        matches!(self, Self::Done | Self::Failed)
+    }
+}
+
+/// A worker whose lease runs.
+#[derive(Clone, Debug)]
+pub(super) struct Worker {
+    /// When its leases end unless it reports.
+    pub deadline: Timestamp,
+    /// Whether it takes jobs.
+    pub ready: bool,
+    /// Whether it reported since the coordinator started. One that did not is known by its leases
+    /// only; that it is gone says nothing about its jobs, for the whole host may have gone.
+    pub reported: bool,
+    /// What it holds, in the order of the grants.
+    pub holds: Vec<Ordinal>,
+    /// The job granted last, by class: its neighbours share images with it.
+    pub last: BTreeMap<Class, Ordinal>,
+}
+
+/// The jobs of the ledger and the workers that live, for [`super::decide`].
+#[derive(Clone, Debug)]
+pub struct Snapshot {
+    pub(super) lease_ms: u64,
+    pub(super) jobs: Vec<Job>,
+    pub(super) ordinals: BTreeMap<JobId, Ordinal>,
+    pub(super) workers: BTreeMap<WorkerId, Worker>,
+    /// Open jobs without unmet needs, by class, in plan order; suspects are in `suspects` instead.
+    pub(super) ready: BTreeMap<Class, BTreeSet<Ordinal>>,
+    pub(super) suspects: BTreeSet<Ordinal>,
+}
+
+impl Snapshot {
+    /// What the ledger holds, in the order of the ledger, at the start of a coordinator: workers
+    /// with leases get one whole lease to report.
+    ///
+    /// Records whose needs do not come before them are left out, with all that need them; the
+    /// ledger never takes such jobs.
+    pub fn new(lease_ms: u64, records: impl IntoIterator<Item = JobRecord>, now: Timestamp) -> Self {
+        let mut snapshot = Self {
+            lease_ms,
+            jobs: Vec::new(),
+            ordinals: BTreeMap::new(),
+            workers: BTreeMap::new(),
+            ready: BTreeMap::new(),
+            suspects: BTreeSet::new(),
+        };
+        for record in records {
+            snapshot.add(record, now);
+        }
+        // What is unmet is known only now that every state is in place.
+        for ordinal in 0..snapshot.jobs.len() as Ordinal {
+            if matches!(snapshot.jobs[ordinal as usize].state, State::Open { .. }) {
+                snapshot.enter_open(ordinal, Timestamp::default());
+            }
+        }
+        snapshot
+    }
+
+    /// How many jobs there are.
+    pub fn len(&self) -> usize {
+        self.jobs.len()
+    }
+
+    /// Whether there are no jobs.
+    pub fn is_empty(&self) -> bool {
+        self.jobs.is_empty()
+    }
+
+    /// Whether the job is known.
+    pub fn knows(&self, job: &JobId) -> bool {
+        self.ordinals.contains_key(job)
+    }
+
+    /// The needs of a job, in its order; empty when it is not known.
+    pub fn needs(&self, job: &JobId) -> Vec<JobId> {
+        let Some(job) = self.get(job) else { return Vec::new() };
+        job.needs.iter().map(|need| self.jobs[*need as usize].id).collect()
+    }
+
+    /// Whether the job is done.
+    pub fn is_done(&self, job: &JobId) -> bool {
+        self.get(job).is_some_and(|job| job.state == State::Done)
+    }
+
+    /// Whether some job could be granted now or after a delay.
+    pub fn has_ready(&self) -> bool {
+        !self.suspects.is_empty() || self.ready.values().any(|jobs| !jobs.is_empty())
+    }
+
+    /// Whether some job has not ended.
+    pub fn has_unfinished(&self) -> bool {
+        self.jobs.iter().any(|job| matches!(job.state, State::Open { .. } | State::Leased { .. }))
+    }
+
+    /// Whether the worker's lease runs and it reported since the coordinator started.
+    pub fn is_alive(&self, worker: &WorkerId) -> bool {
+        self.workers.get(worker).is_some_and(|worker| worker.reported)
+    }
+
+    /// How many workers are alive.
+    pub fn alive(&self) -> usize {
+        self.workers.values().filter(|worker| worker.reported).count()
+    }
+
+    /// How many jobs a worker holds.
+    pub fn held_by(&self, worker: &WorkerId) -> usize {
+        self.workers.get(worker).map_or(0, |worker| worker.holds.len())
+    }
+
+    pub(super) fn get(&self, job: &JobId) -> Option<&Job> {
+        self.ordinals.get(job).map(|ordinal| &self.jobs[*ordinal as usize])
+    }
+
+    /// Whether the worker holds this try of the job.
+    pub(super) fn holds(&self, worker: &WorkerId, job: &JobId, attempt: Attempt) -> bool {
+        self.get(job).is_some_and(|job| {
+            job.attempt == attempt && matches!(&job.state, State::Leased { worker: of, .. } if of == worker)
+        })
+    }
+
+    /// Changes the snapshot as the command says; `false` when the command comes too late, so that
+    /// nothing changed. The same conditions stand in the ledger's statements.
+    pub fn apply(&mut self, command: &Command, now: Timestamp) -> bool {
+        match command {
+            Command::Insert { shape } => {
+                !self.knows(&shape.id) && self.add(JobRecord::new(shape.clone()), now)
+            }
+            Command::Reopen { job, why } => self.reopen(job, *why),
+            Command::Admit { worker, ready, deadline } => {
+                let worker = self.workers.entry(worker.clone()).or_insert_with(|| Worker::new(*deadline));
+                (worker.ready, worker.deadline, worker.reported) = (*ready, *deadline, true);
+                true
+            }
+            Command::Renew { job, attempt, worker, started, .. } => {
+                self.change_lease(job, *attempt, Some(worker), |job, _| {
+                    if let State::Leased { started: is, .. } = &mut job.state {
+                        *is = *started;
+                    }
+                })
+            }
+            Command::Grant { job, attempt, worker, .. } => self.grant(job, *attempt, worker),
+            Command::Complete { job, attempt, worker } => self.end(job, *attempt, Some(worker), State::Done),
+            Command::GiveUp { job, attempt, .. } => self.end(job, *attempt, None, State::Failed),
+            Command::Retry { job, attempt, failures, until } => {
+                self.take_back(job, *attempt, *until, |job| job.failures = *failures)
+            }
+            Command::Release { job, attempt } => self.take_back(job, *attempt, now, |_| ()),
+            Command::Suspect { job, attempt, deaths_alone } => self.take_back(job, *attempt, now, |job| {
+                job.suspect = true;
+                job.deaths_alone = *deaths_alone;
+            }),
+            Command::Cancel { job } => self.cancel(job),
+            Command::Dismiss { worker } => self.workers.remove(worker).is_some(),
+            Command::Revoke { .. } | Command::Acknowledge { .. } | Command::CountLate { .. } => true,
+        }
+    }
+
+    fn add(&mut self, record: JobRecord, now: Timestamp) -> bool {
+        let JobRecord { shape, state, attempt, failures, suspect, deaths_alone, outdated } = record;
+        let needs: Option<Box<[Ordinal]>> =
+            shape.needs.iter().map(|need| self.ordinals.get(need).copied()).collect();
+        let Some(needs) = needs else { return false };
+        let ordinal = self.jobs.len() as Ordinal;
+        for need in &needs {
+            self.jobs[*need as usize].dependents.push(ordinal);
+        }
+        let state = match state {
+            LedgerState::Open => State::Open { unmet: 0, not_before: now },
+            LedgerState::Leased(worker) => {
+                let deadline = now.plus(self.lease_ms);
+                let of = self.workers.entry(worker.clone()).or_insert_with(|| Worker::new(deadline));
+                of.holds.push(ordinal);
+                State::Leased { worker, started: false }
+            }
+            LedgerState::Done => State::Done,
+            LedgerState::Failed => State::Failed,
+            LedgerState::Cancelled => State::Cancelled,
+        };
+        let is_open = matches!(state, State::Open { .. });
+        self.ordinals.insert(shape.id, ordinal);
+        self.jobs.push(Job {
+            id: shape.id,
+            class: shape.class,
+            needs,
+            dependents: Vec::new(),
+            state,
+            attempt,
+            failures,
+            suspect,
+            deaths_alone,
+            outdated,
+        });
+        if is_open {
+            self.enter_open(ordinal, now);
+        }
+        true
+    }
+
+    fn grant(&mut self, job: &JobId, attempt: Attempt, worker: &WorkerId) -> bool {
+        let Some(&ordinal) = self.ordinals.get(job) else { return false };
+        let job = &mut self.jobs[ordinal as usize];
+        let is_ready = matches!(job.state, State::Open { unmet: 0, .. });
+        let (Some(holder), true) = (self.workers.get_mut(worker), is_ready && attempt > job.attempt) else {
+            return false;
+        };
+        holder.holds.push(ordinal);
+        holder.last.insert(job.class, ordinal);
+        job.attempt = attempt;
+        job.state = State::Leased { worker: worker.clone(), started: false };
+        self.leave_ready(ordinal);
+        true
+    }
+
+    /// Ends a lease with a result or for good, and with it the wait of those who need the job.
+    fn end(&mut self, job: &JobId, attempt: Attempt, worker: Option<&WorkerId>, state: State) -> bool {
+        self.change_lease(job, attempt, worker, |job, _| {
+            // What failed may leave others without it; what is done is waited for by all others.
+            job.outdated = state == State::Failed;
+            job.state = state;
+            (job.failures, job.suspect, job.deaths_alone) = (0, false, 0);
+        }) && {
+            let ordinal = self.ordinals[job];
+            self.drop_from_holder(ordinal);
+            self.tell_dependents(ordinal, |unmet| unmet.saturating_sub(1));
+            true
+        }
+    }
+
+    /// Ends a lease without a result.
+    fn take_back(
+        &mut self,
+        job: &JobId,
+        attempt: Attempt,
+        not_before: Timestamp,
+        change: impl FnOnce(&mut Job),
+    ) -> bool {
+        self.change_lease(job, attempt, None, |job, _| change(job)) && {
+            let ordinal = self.ordinals[job];
+            self.drop_from_holder(ordinal);
+            self.enter_open(ordinal, not_before);
+            true
+        }
+    }
+
+    /// Changes a job whose lease is at this attempt (and with this worker); `false` if it is not.
+    fn change_lease(
+        &mut self,
+        job: &JobId,
+        attempt: Attempt,
+        worker: Option<&WorkerId>,
+        change: impl FnOnce(&mut Job, Ordinal),
+    ) -> bool {
+        let Some(&ordinal) = self.ordinals.get(job) else { return false };
+        let job = &mut self.jobs[ordinal as usize];
+        match &job.state {
+            State::Leased { worker: holder, .. }
+                if job.attempt == attempt && worker.is_none_or(|worker| worker == holder) =>
+            {
+                change(job, ordinal);
+                true
+            }
+            _ => false,
+        }
+    }
+
+    fn reopen(&mut self, job: &JobId, why: Reopening) -> bool {
+        let Some(&ordinal) = self.ordinals.get(job) else { return false };
+        let job = &mut self.jobs[ordinal as usize];
+        let had_ended = job.state.has_ended();
+        let allowed = match why {
+            Reopening::Resubmitted => matches!(job.state, State::Failed | State::Cancelled),
+            Reopening::ResultLost => job.state == State::Done,
+            Reopening::NewInput => matches!(job.state, State::Done | State::Leased { .. }),
+        };
+        if !allowed {
+            return false;
+        }
+        (job.failures, job.suspect, job.deaths_alone) = (0, false, 0);
+        // A lost result comes back as it was; with a new input it may differ.
+        job.outdated |= why == Reopening::NewInput && had_ended;
+        self.drop_from_holder(ordinal);
+        if had_ended {
+            self.tell_dependents(ordinal, |unmet| unmet + 1);
+        }
+        self.enter_open(ordinal, Timestamp::default());
+        true
+    }
+
+    fn cancel(&mut self, job: &JobId) -> bool {
+        let Some(&ordinal) = self.ordinals.get(job) else { return false };
+        if !matches!(self.jobs[ordinal as usize].state, State::Open { .. } | State::Leased { .. }) {
+            return false;
+        }
+        self.drop_from_holder(ordinal);
+        self.leave_ready(ordinal);
+        self.jobs[ordinal as usize].state = State::Cancelled;
+        true
+    }
+
+    fn drop_from_holder(&mut self, ordinal: Ordinal) {
+        // A job is in the hands of one worker at most, and workers hold few jobs.
+        for worker in self.workers.values_mut() {
+            worker.holds.retain(|held| *held != ordinal);
+        }
+    }
+
+    /// Makes a job open, and ready when all it needs has ended.
+    fn enter_open(&mut self, ordinal: Ordinal, not_before: Timestamp) {
+        let needs = self.jobs[ordinal as usize].needs.iter();
+        let unmet = needs.filter(|need| !self.jobs[**need as usize].state.has_ended()).count() as u32;
+        self.jobs[ordinal as usize].state = State::Open { unmet, not_before };
+        self.place(ordinal);
+    }
+
+    /// Adjusts what the open jobs that need this one wait for.
+    fn tell_dependents(&mut self, ordinal: Ordinal, change: impl Fn(u32) -> u32) {
+        let dependents = std::mem::take(&mut self.jobs[ordinal as usize].dependents);
+        for dependent in &dependents {
+            if let State::Open { unmet, .. } = &mut self.jobs[*dependent as usize].state {
+                *unmet = change(*unmet);
+                self.place(*dependent);
+            }
+        }
+        self.jobs[ordinal as usize].dependents = dependents;
+    }
+
+    /// Puts an open job into the set where it belongs.
+    fn place(&mut self, ordinal: Ordinal) {
+        self.leave_ready(ordinal);
+        let job = &self.jobs[ordinal as usize];
+        if matches!(job.state, State::Open { unmet: 0, .. }) {
+            if job.suspect {
+                self.suspects.insert(ordinal);
+            } else {
+                self.ready.entry(job.class).or_default().insert(ordinal);
+            }
+        }
+    }
+
+    fn leave_ready(&mut self, ordinal: Ordinal) {
+        self.suspects.remove(&ordinal);
+        if let Some(ready) = self.ready.get_mut(&self.jobs[ordinal as usize].class) {
+            ready.remove(&ordinal);
+        }
+    }
+}
+
+impl JobRecord {
+    /// A job that nobody has tried yet.
+    pub fn new(shape: JobShape) -> Self {
+        Self {
+            shape,
+            state: LedgerState::Open,
+            attempt: Attempt(0),
+            failures: 0,
+            suspect: false,
+            deaths_alone: 0,
+            outdated: false,
+        }
+    }
+}
+
+impl Worker {
+    fn new(deadline: Timestamp) -> Self {
+        Self { deadline, ready: false, reported: false, holds: Vec::new(), last: BTreeMap::new() }
+    }
+}

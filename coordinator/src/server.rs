@@ -1,0 +1,195 @@
+//! A running coordinator: ledger, driver and gRPC server, started and stopped together.
+
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use planesweep_plan::{Job, JobId, RunId};
+use planesweep_proto::wire::coordinator_server::CoordinatorServer;
+use planesweep_proto::{JobResult, Order, RunStatus, ServiceError, SubmitHeader, Submitted};
+use thiserror::Error;
+use tokio::net::TcpListener;
+use tokio::task::JoinHandle;
+use tokio_util::sync::{CancellationToken, DropGuard};
+use tonic::service::interceptor::InterceptedService;
+use tonic::transport::Server;
+use tonic::transport::server::TcpIncoming;
+
+use crate::config::{Config, ConfigError};
+use crate::driver::{Driver, DriverHandle, Message, Settings};
+use crate::ledger::{Ledger, LedgerError};
+use crate::service::{CheckToken, Service, refusal};
+
+/// How often a connection is probed, and how long the answer may take.
+const KEEP_ALIVE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(5));
+/// How long calls may take to end when the server stops.
+const CLOSING: Duration = Duration::from_secs(2);
+
+/// Why a coordinator did not start.
+#[derive(Debug, Error)]
+pub enum StartError {
+    /// The configuration is refused.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The ledger is.
+    #[error(transparent)]
+    Ledger(#[from] LedgerError),
+    /// The address is taken, or not of this host.
+    #[error("could not listen on {listen}")]
+    Listen {
+        /// The address.
+        listen: SocketAddr,
+        /// Why.
+        #[source]
+        source: io::Error,
+    },
+}
+
+/// Starts coordinators.
+#[derive(Debug)]
+pub struct Coordinator;
+
+impl Coordinator {
+    /// Opens the ledger, goes on with what it holds, and serves. The address is bound when this
+    /// returns.
+    pub async fn start(config: Config) -> Result<Handle, StartError> {
+        let token = config.check()?;
+        let listener = TcpListener::bind(config.listen).await;
+        let listener = listener.map_err(|source| StartError::Listen { listen: config.listen, source })?;
+        let local_addr =
+            listener.local_addr().map_err(|source| StartError::Listen { listen: config.listen, source })?;
+        let ledger = Arc::new(Ledger::open(&config.ledger).await?);
+        let closed = CancellationToken::new();
+        let settings = Settings {
+            lease: config.lease,
+            report_interval: config.report_interval(),
+            store_url: config.store_url.clone(),
+        };
+        let (driver, driver_task) = Driver::start(ledger.clone(), settings, closed.clone()).await?;
+        let service = Service { driver, ledger };
+        let server = InterceptedService::new(service.clone().into_server(), CheckToken(token));
+        let (health, health_service) = tonic_health::server::health_reporter();
+        health.set_serving::<CoordinatorServer<Service>>().await;
+        let stop = CancellationToken::new();
+        let stopped = stop.clone().cancelled_owned();
+        let server_task = tokio::spawn(
+            Server::builder()
+                .tcp_nodelay(true)
+                .http2_keepalive_interval(Some(KEEP_ALIVE.0))
+                .http2_keepalive_timeout(Some(KEEP_ALIVE.1))
+                .add_service(health_service)
+                .add_service(server)
+                .serve_with_incoming_shutdown(TcpIncoming::from(listener).with_nodelay(Some(true)), stopped),
+        );
+        Ok(Handle {
+            local_addr,
+            report_interval: config.report_interval(),
+            service,
+            stop: stop.drop_guard(),
+            closed: closed.drop_guard(),
+            driver_task,
+            server_task,
+        })
+    }
+}
+
+/// A running coordinator. Dropped without [`Handle::shutdown`], it stops as if it were killed.
+pub struct Handle {
+    local_addr: SocketAddr,
+    report_interval: Duration,
+    service: Service,
+    stop: DropGuard,
+    closed: DropGuard,
+    driver_task: JoinHandle<()>,
+    server_task: JoinHandle<Result<(), tonic::transport::Error>>,
+}
+
+impl Handle {
+    /// Where it listens.
+    pub fn local_addr(&self) -> SocketAddr {
+        self.local_addr
+    }
+
+    /// The address for [`planesweep_proto::Client::connect`].
+    pub fn url(&self) -> String {
+        format!("http://{}", self.local_addr)
+    }
+
+    /// Submits a plan, as over the wire; each job follows those that it needs.
+    pub async fn submit(&self, header: SubmitHeader, jobs: Vec<Job>) -> Result<Submitted, ServiceError> {
+        self.driver().ask(|reply| Message::Submit(header, jobs, reply)).await?
+    }
+
+    /// How far a run is, with the jobs that ended after `after` (0, then the last `ended` seen).
+    pub async fn status(&self, run: &RunId, after: u64) -> Result<RunStatus, ServiceError> {
+        self.service.status_of(run, after).await
+    }
+
+    /// Every job of a run, in the order of the plan.
+    pub async fn results(&self, run: &RunId) -> Result<Vec<JobResult>, ServiceError> {
+        self.service.ledger.results(run, 0, usize::MAX >> 1).await.map_err(|e| refusal(&e))
+    }
+
+    /// Stops a run; what is done stays.
+    pub async fn cancel(&self, run: &RunId) -> Result<(), ServiceError> {
+        self.driver().ask(|reply| Message::Cancel(run.clone(), reply)).await?
+    }
+
+    /// Makes done jobs run again whose results are no longer in the store; says how many there were.
+    pub async fn forget_results(&self, jobs: Vec<JobId>) -> Result<usize, ServiceError> {
+        self.driver().ask(|reply| Message::ForgetResults(jobs, reply)).await?
+    }
+
+    /// Waits until every job of a run ended, or the run was cancelled. Waits for ever when no worker
+    /// comes; [`Handle::status`] tells.
+    pub async fn wait_finished(&self, run: &RunId) -> Result<RunStatus, ServiceError> {
+        let mut changes = self.driver().changes();
+        loop {
+            changes.borrow_and_update();
+            if self.service.ledger.is_finished(run).await.map_err(|e| refusal(&e))? {
+                return self.status(run, 0).await;
+            }
+            if changes.changed().await.is_err() {
+                return Err(ServiceError::new(
+                    planesweep_proto::Code::Unavailable,
+                    "the coordinator is stopping",
+                ));
+            }
+        }
+    }
+
+    /// Tells all workers to end what they hold and go; nothing new is granted.
+    pub async fn drain(&self) -> Result<(), ServiceError> {
+        self.driver().tell(Message::SetOrder(Order::Drain)).await
+    }
+
+    /// Tells the workers to stop, waits a report interval at most until all know it, and closes.
+    pub async fn shutdown(self) {
+        let driver = self.driver();
+        let told = async {
+            driver.tell(Message::SetOrder(Order::Stop)).await?;
+            while !driver.ask(Message::AllStopped).await? {
+                tokio::time::sleep(self.report_interval / 50).await;
+            }
+            Ok::<(), ServiceError>(())
+        };
+        // Who does not hear it in time finds nobody to report to, and ends by its own lease.
+        let _ = tokio::time::timeout(self.report_interval, told).await;
+        drop(self.stop);
+        let mut server_task = self.server_task;
+        if tokio::time::timeout(CLOSING, &mut server_task).await.is_err() {
+            server_task.abort();
+            let _ = server_task.await;
+        }
+        drop(self.closed);
+        let _ = self.driver_task.await;
+        if let Some(ledger) = Arc::into_inner(self.service.ledger) {
+            ledger.close().await;
+        }
+    }
+
+    fn driver(&self) -> &DriverHandle {
+        &self.service.driver
+    }
+}

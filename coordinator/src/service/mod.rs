@@ -1,0 +1,91 @@
+//! The gRPC handlers: decode, hand to the driver or the ledger, encode. No decisions.
+
+mod auth;
+mod report;
+mod runs;
+
+use std::pin::Pin;
+use std::sync::Arc;
+
+use planesweep_proto::limits::MAX_MESSAGE_BYTES;
+use planesweep_proto::wire::coordinator_server::{Coordinator, CoordinatorServer};
+use planesweep_proto::{Code, PROTOCOL_VERSION, ServiceError, wire};
+use tokio_stream::Stream;
+use tonic::{Request, Response, Status, Streaming};
+
+pub(crate) use auth::CheckToken;
+
+use crate::driver::{DriverHandle, describe};
+use crate::ledger::{Ledger, LedgerError};
+
+/// What the handlers need.
+#[derive(Clone)]
+pub(crate) struct Service {
+    pub driver: DriverHandle,
+    pub ledger: Arc<Ledger>,
+}
+
+impl Service {
+    pub(crate) fn into_server(self) -> CoordinatorServer<Self> {
+        CoordinatorServer::new(self)
+            .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            .max_encoding_message_size(MAX_MESSAGE_BYTES)
+    }
+}
+
+#[tonic::async_trait]
+impl Coordinator for Service {
+    type ResultsStream = Pin<Box<dyn Stream<Item = Result<wire::ResultsChunk, Status>> + Send>>;
+
+    async fn report(
+        &self,
+        request: Request<wire::ReportRequest>,
+    ) -> Result<Response<wire::ReportReply>, Status> {
+        Ok(Response::new(self.answer_report(request.into_inner()).await?))
+    }
+
+    async fn submit(
+        &self,
+        request: Request<Streaming<wire::SubmitChunk>>,
+    ) -> Result<Response<wire::SubmitReply>, Status> {
+        Ok(Response::new(self.answer_submit(request.into_inner()).await?))
+    }
+
+    async fn status(
+        &self,
+        request: Request<wire::StatusRequest>,
+    ) -> Result<Response<wire::StatusReply>, Status> {
+        Ok(Response::new(self.answer_status(request.into_inner()).await?))
+    }
+
+    async fn results(
+        &self,
+        request: Request<wire::ResultsRequest>,
+    ) -> Result<Response<Self::ResultsStream>, Status> {
+        Ok(Response::new(self.answer_results(request.into_inner()).await?))
+    }
+
+    async fn cancel(
+        &self,
+        request: Request<wire::CancelRequest>,
+    ) -> Result<Response<wire::CancelReply>, Status> {
+        Ok(Response::new(self.answer_cancel(request.into_inner()).await?))
+    }
+}
+
+fn check_protocol(version: u32) -> Result<(), ServiceError> {
+    if version == PROTOCOL_VERSION {
+        return Ok(());
+    }
+    let text = format!("the caller speaks protocol {version}, the coordinator {PROTOCOL_VERSION}");
+    Err(ServiceError::new(Code::VersionMismatch, text))
+}
+
+/// A failure of the ledger as callers learn of it.
+pub(crate) fn refusal(error: &LedgerError) -> ServiceError {
+    let code = match error {
+        LedgerError::NoSuchRun { .. } => Code::NotFound,
+        _ => Code::Internal,
+    };
+    ServiceError::new(code, describe(error))
+}
