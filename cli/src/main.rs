@@ -1,3 +1,52 @@
-//! The `planesweep` program.
+//! The `planesweep` program: photographs with known cameras in, depth maps and one dense, coloured
+//! point cloud out.
+//!
+//! This crate parses, prints and draws progress; what is computed lives in the stages' crates.
 
-fn main() {}
+mod args;
+mod commands;
+mod console;
+mod input;
+mod network;
+mod out_folder;
+mod run_record;
+mod supervisor;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+use crate::args::{Cli, Command};
+use crate::console::Outcome;
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    console::start_logging(cli.verbose);
+    let json = cli.json;
+    let done = match cli.command {
+        Command::Reconstruct(args) => commands::reconstruct::run(&args, json),
+        Command::Inspect(args) => commands::inspect::run(&args),
+        Command::Depth(args) => commands::depth::run(&args),
+        Command::Synth(args) => commands::synth::run(&args),
+        Command::Weights(args) => commands::weights::run(&args),
+        Command::Evaluate(args) => commands::evaluate::run(&args),
+        Command::Worker(args) => commands::worker::run(args),
+    };
+    match done {
+        Ok(Outcome { text, value, skipped_views }) => {
+            if json {
+                println!("{value}");
+            } else {
+                print!("{text}");
+            }
+            if skipped_views { ExitCode::from(3) } else { ExitCode::SUCCESS }
+        }
+        Err(error) => {
+            if json {
+                println!("{}", serde_json::json!({ "error": format!("{error:#}") }));
+            }
+            eprintln!("planesweep: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}

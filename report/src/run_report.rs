@@ -109,8 +109,6 @@ impl Add for Funnel {
 /// A view that has no depth map.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SkippedView {
-    /// Its id in the scene.
-    pub id: ViewId,
     /// Its name in the scene.
     pub name: String,
     /// Why.
@@ -181,7 +179,6 @@ pub(crate) mod tests {
             ],
             views: vec![view(1, 50_000), view(2, 41_000)],
             skipped: vec![SkippedView {
-                id: ViewId(7),
                 name: "lonely.jpg".into(),
                 reason: "no other view sees its points".into(),
             }],

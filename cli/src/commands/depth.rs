@@ -1,0 +1,118 @@
+//! `planesweep depth`: one view, in this process, without a coordinator.
+
+use std::time::Instant;
+
+use anyhow::{Context, Result, bail};
+use planesweep_mvsnet::{DepthBackend, InferInput, TorchBackend, Weights};
+use planesweep_plan::{Plan, ViewPlan, plan, working_size};
+use planesweep_scene::{DepthMap, Raster, Scene, ViewId, WorkingImage, read_image, read_scene};
+use rayon::prelude::*;
+use serde_json::{Value, json};
+
+use crate::args::DepthArgs;
+use crate::console::Outcome;
+use crate::network::read_weights;
+use crate::out_folder::{MapFiles, OutFolder, depth_range};
+
+/// Infers and writes one depth map.
+pub fn run(args: &DepthArgs) -> Result<Outcome> {
+    let scene = read_scene(&args.scene, &args.read.options())
+        .with_context(|| format!("cannot read the scene {}", args.scene.display()))?;
+    let plan = plan(&scene, &args.plan.options(None));
+    let view = find(&scene, &plan, &args.view)?;
+    let (_, weights) = read_weights(&args.network.weights)?;
+
+    let begun = Instant::now();
+    let ids: Vec<ViewId> = std::iter::once(view.view).chain(view.sources.iter().copied()).collect();
+    let images: Vec<WorkingImage> =
+        ids.par_iter().map(|id| working_image(&scene, &plan, *id)).collect::<Result<_>>()?;
+    let sources: Vec<&WorkingImage> = images[1..].iter().collect();
+    let input = InferInput { reference: &images[0], sources: &sources, hypotheses: &view.hypotheses };
+    let images_seconds = begun.elapsed().as_secs_f64();
+    let (map, probability) = infer(args, &weights, input)?;
+    let seconds = begun.elapsed().as_secs_f64();
+
+    let name = &scene.views[&view.view].name;
+    let out = OutFolder::create(&args.out, [(view.view, name.as_str())])?;
+    let everything = Raster::filled(map.width(), map.height(), true);
+    let files = out.write_map(view.view, &map, &everything, &depth_range(&view.hypotheses))?;
+    let probed = write_probability(args, &out, view, probability.as_deref())?;
+    let confident = map.confidence.values().iter().filter(|c| **c > 0.8).count();
+    let share = confident as f64 / map.confidence.values().len() as f64;
+    let MapFiles { depth, confidence, preview, .. } = &files;
+    let text = format!(
+        "{name}: {}x{} depths in {seconds:.1} s, {:.0} % of them above confidence 0.8\n{}\n{}\n{}\n",
+        map.width(),
+        map.height(),
+        100.0 * share,
+        depth.display(),
+        confidence.display(),
+        preview.display(),
+    );
+    let value = json!({
+        "view": name,
+        "width": map.width(),
+        "height": map.height(),
+        "seconds": seconds,
+        "seconds_for_images": images_seconds,
+        "confident_share": share,
+        "hypotheses": view.hypotheses,
+        "sources": view.sources,
+        "depth": depth,
+        "confidence": confidence,
+        "preview": preview,
+        "probability": probed,
+    });
+    Ok(Outcome { text, value, skipped_views: false })
+}
+
+/// The depth map, and the probability over depth at the probed pixel.
+fn infer(args: &DepthArgs, weights: &Weights, input: InferInput<'_>) -> Result<(DepthMap, Option<Vec<f32>>)> {
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let mut backend = TorchBackend::new(weights, &args.network.device, threads)?;
+    let map = backend.infer(input).context("cannot infer the depth map")?;
+    let probability = match args.probe.as_deref() {
+        Some([x, y]) => Some(backend.probability(input, *x, *y).context("cannot probe")?),
+        _ => None,
+    };
+    Ok((map, probability))
+}
+
+fn find<'a>(scene: &Scene, plan: &'a Plan, wanted: &str) -> Result<&'a ViewPlan> {
+    let known = scene.views.values().find(|view| view.name == wanted || view.id.to_string() == wanted);
+    let Some(known) = known else {
+        let names: Vec<&str> = scene.views.values().take(10).map(|view| view.name.as_str()).collect();
+        bail!("there is no view \"{wanted}\"; the first views are {}", names.join(", "));
+    };
+    if let Some(reason) = plan.skipped.get(&known.id) {
+        bail!("view \"{wanted}\" cannot be inferred: {reason}");
+    }
+    plan.views.iter().find(|view| view.view == known.id).context("the plan leaves the view out")
+}
+
+fn working_image(scene: &Scene, plan: &Plan, id: ViewId) -> Result<WorkingImage> {
+    let view = &scene.views[&id];
+    let size = &view.camera.intrinsics;
+    let (width, height) = working_size(size.width, size.height, plan.options.max_size);
+    let pixels = read_image(&view.image)?;
+    WorkingImage::prepare(pixels, &view.camera, &view.distortion, width, height)
+        .with_context(|| format!("cannot prepare view {}", view.name))
+}
+
+/// Writes depth and probability of every plane as CSV, to be plotted like the paper's figure 3.
+fn write_probability(
+    args: &DepthArgs,
+    out: &OutFolder,
+    view: &ViewPlan,
+    probability: Option<&[f32]>,
+) -> Result<Value> {
+    let (Some(probability), Some([x, y])) = (probability, args.probe.as_deref()) else {
+        return Ok(Value::Null);
+    };
+    let mut csv = "depth,probability\n".to_owned();
+    for (depth, probability) in view.hypotheses.depths().iter().zip(probability) {
+        csv.push_str(&format!("{depth},{probability}\n"));
+    }
+    let path = out.write_file(&format!("probability-{x}-{y}.csv"), csv.as_bytes())?;
+    Ok(json!(path))
+}

@@ -1,0 +1,290 @@
+//! From the results in the store to the files that people use.
+
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+use anyhow::{Context, Result, bail};
+use bytes::Bytes;
+use planesweep_fusion::{Point, read_ply};
+use planesweep_plan::{BlobKey, NUMERICS_VERSION, ViewPlan};
+use planesweep_proto::{CODE_VERSION, JobResult, JobState};
+use planesweep_report::{
+    Funnel, Pictures, RunReport, SkippedView, StageReport, Totals, ViewReport, encode_png, render_cloud,
+    render_html,
+};
+use planesweep_scene::{
+    Camera, Raster, SourceScore, ViewId, mvsnet_cam_text, mvsnet_pair_text, write_atomically,
+};
+use planesweep_worker::{Store, decode_depth_map, decode_filtered_map};
+use rayon::prelude::*;
+use serde_json::json;
+use tokio::runtime::Runtime;
+
+use super::reconstruct::{Prepared, Stages};
+use crate::args::ReconstructArgs;
+use crate::console::Outcome;
+use crate::input::{Skipped, all_skipped};
+use crate::out_folder::{OutFolder, depth_range, trajectory};
+use crate::run_record::{FILE_NAME, RecordedView, RunRecord};
+
+/// Size of the picture of the cloud in the report.
+const CLOUD_PICTURE: (u32, u32) = (1280, 960);
+
+/// A run whose jobs have ended.
+pub struct Finished<'a> {
+    pub args: &'a ReconstructArgs,
+    pub prepared: &'a Prepared,
+    pub store: &'a Store,
+    pub results: &'a [JobResult],
+    pub runtime: &'a Runtime,
+}
+
+/// What is known of a view when its files are written.
+struct ExportedView {
+    record: RecordedView,
+    report: ViewReport,
+    preview: Raster<[u8; 3]>,
+}
+
+/// Writes the result folder.
+pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Outcome> {
+    let writing = Instant::now();
+    let scene = &run.prepared.input.scene;
+    let planned = run.prepared.plan.views.iter().map(|v| (v.view, scene.views[&v.view].name.as_str()));
+    let out = OutFolder::create(&run.args.out, planned)?;
+    let mut views: Vec<&ViewPlan> = run.prepared.plan.views.iter().collect();
+    views.sort_by_key(|view| view.view);
+    let exported: Vec<Option<ExportedView>> =
+        views.par_iter().map(|view| export_view(run, &out, view)).collect::<Result<_>>()?;
+    let exported: Vec<ExportedView> = exported.into_iter().flatten().collect();
+    write_mvsnet_side(&out, &exported)?;
+    let skipped = skipped_views(run);
+    let (cloud_key, points) = write_cloud(run, &out)?;
+
+    for kind in ["infer", "filter", "emit", "assemble"] {
+        // What an inference waited for the device is not its own time.
+        let seconds = |r: &JobResult| r.measurements.get("network_seconds").copied().unwrap_or(r.seconds);
+        let seconds = run.results.iter().filter(|r| r.kind == kind).map(seconds).sum();
+        stages.push((format!("of it {kind}, summed over workers"), seconds));
+    }
+    stages.push(("write the result".to_owned(), writing.elapsed().as_secs_f64()));
+    let record = record(run, &exported, &skipped, cloud_key, points.len() as u64);
+    out.write_file(FILE_NAME, &serde_json::to_vec_pretty(&record).context("cannot write run.json")?)?;
+    let report = report(run, &exported, &skipped, &stages, points.len() as u64, begun);
+    write_report(&out, &report, exported, &points)?;
+
+    let mut text = String::new();
+    for (name, seconds) in &stages {
+        text.push_str(&format!("{seconds:8.1} s  {name}\n"));
+    }
+    text.push_str(&format!("{:8.1} s  in all\n", report.totals.wall_seconds));
+    for view in &skipped {
+        text.push_str(&format!("skipped: {}: {}\n", view.view, view.reason));
+    }
+    let root = out.root().display();
+    text.push_str(&format!(
+        "{} points in {root}/cloud.ply; {root}/report.html shows the rest\n",
+        points.len()
+    ));
+    let value = json!({
+        "out": out.root(),
+        "points": points.len(),
+        "cloud_blake3": cloud_key.to_string(),
+        "skipped": skipped,
+        "stages": stages,
+        "report": report,
+    });
+    Ok(Outcome { text, value, skipped_views: !skipped.is_empty() })
+}
+
+fn result_of<'a>(run: &'a Finished<'_>, kind: &str, view: Option<ViewId>) -> Option<&'a JobResult> {
+    run.results.iter().find(|result| result.kind == kind && result.view == view)
+}
+
+fn blob(run: &Finished<'_>, result: &JobResult) -> Result<Option<Bytes>> {
+    let Some((key, _)) = &result.blob else { return Ok(None) };
+    Ok(Some(run.runtime.block_on(run.store.get(key))?))
+}
+
+/// Writes depth, confidence and preview; `None` when the view's inference failed.
+fn export_view(run: &Finished<'_>, out: &OutFolder, plan: &ViewPlan) -> Result<Option<ExportedView>> {
+    let view = &run.prepared.input.scene.views[&plan.view];
+    let Some(infer) = result_of(run, "infer", Some(plan.view)) else { return Ok(None) };
+    let Some(bytes) = blob(run, infer)? else { return Ok(None) };
+    let map =
+        decode_depth_map(&bytes).with_context(|| format!("cannot read the depth map of {}", view.name))?;
+    let mut funnel = Funnel { pixels: map.depth.values().len() as u64, ..Funnel::default() };
+    let mut kept = Raster::filled(map.width(), map.height(), false);
+    let filter = result_of(run, "filter", Some(plan.view));
+    if let Some(bytes) = filter.map(|result| blob(run, result)).transpose()?.flatten() {
+        let filtered =
+            decode_filtered_map(&bytes).with_context(|| format!("cannot read the mask of {}", view.name))?;
+        kept = filtered.depth.map(|depth| *depth > 0.0);
+        (funnel.photometric, funnel.geometric) = (filtered.funnel.photometric, filtered.funnel.geometric);
+    }
+    let emit = result_of(run, "emit", Some(plan.view));
+    funnel.emitted = emit.and_then(|r| r.measurements.get("points")).map_or(0, |points| *points as u64);
+    let files = out.write_map(plan.view, &map, &kept, &depth_range(&plan.hypotheses))?;
+    let names =
+        |ids: &[ViewId]| ids.iter().map(|id| run.prepared.input.scene.views[id].name.clone()).collect();
+    let report = ViewReport {
+        id: plan.view,
+        name: view.name.clone(),
+        width: map.width() as u32,
+        height: map.height() as u32,
+        depth_min: plan.hypotheses.min(),
+        depth_max: plan.hypotheses.max(),
+        depth_count: plan.hypotheses.count(),
+        sampling: plan.hypotheses.sampling(),
+        sources: names(&plan.sources),
+        funnel,
+        seconds: infer.seconds,
+        preview: Some(files.preview_name),
+        warnings: Vec::new(),
+    };
+    let record = RecordedView {
+        id: plan.view,
+        name: view.name.clone(),
+        file: out.file_name(plan.view).to_owned(),
+        image: view.image.clone(),
+        image_blake3: run.prepared.input.image_hashes[&plan.view],
+        image_camera: view.camera,
+        distortion: view.distortion,
+        depth_camera: map.camera,
+        hypotheses: plan.hypotheses,
+        sources: plan.sources.clone(),
+        neighbours: plan.neighbours.clone(),
+    };
+    Ok(Some(ExportedView { record, report, preview: files.picture }))
+}
+
+/// Cameras, pairs and trajectory, as users of MVSNet folders and of Tanks and Temples want them.
+fn write_mvsnet_side(out: &OutFolder, views: &[ExportedView]) -> Result<()> {
+    let mut pairs = BTreeMap::new();
+    for ExportedView { record, .. } in views {
+        let cam = mvsnet_cam_text(&record.depth_camera, Some(&depth_range(&record.hypotheses)));
+        out.write_file(&format!("cams/{:08}_cam.txt", record.id.0), cam.as_bytes())?;
+        // The scores are ranks: best first is all that readers of the file use.
+        let count = record.neighbours.len();
+        let scored = record.neighbours.iter().enumerate();
+        let scored = scored.map(|(rank, view)| SourceScore { view: *view, score: (count - rank) as f64 });
+        pairs.insert(record.id, scored.collect());
+    }
+    out.write_file("pair.txt", mvsnet_pair_text(&pairs).as_bytes())?;
+    let cameras = views.iter().map(|view| &view.record.depth_camera);
+    out.write_file("trajectory.log", trajectory(cameras).as_bytes())?;
+    Ok(())
+}
+
+fn write_cloud(run: &Finished<'_>, out: &OutFolder) -> Result<(BlobKey, Vec<Point>)> {
+    let assembled = result_of(run, "assemble", None).context("the ledger knows no cloud")?;
+    let Some((key, _)) = assembled.blob else {
+        let (_, message) = assembled.failure.clone().unwrap_or_default();
+        bail!("there is no cloud: {message}; previews of the depth maps are in {}", out.root().display());
+    };
+    let bytes = blob(run, assembled)?.context("the cloud is not in the store")?;
+    let path = out.root().join("cloud.ply");
+    write_atomically(&path, &bytes).with_context(|| format!("cannot write {}", path.display()))?;
+    Ok((key, read_ply(&path)?))
+}
+
+/// All views without a depth map: left out before, or failed for good.
+fn skipped_views(run: &Finished<'_>) -> Vec<Skipped> {
+    let mut skipped = all_skipped(&run.prepared.input, &run.prepared.plan);
+    for result in run.results.iter().filter(|r| r.kind == "infer" && r.state == JobState::Failed) {
+        let view = result.view.and_then(|id| run.prepared.input.scene.views.get(&id));
+        let (_, reason) = result.failure.clone().unwrap_or_default();
+        skipped.extend(view.map(|view| Skipped { view: view.name.clone(), reason }));
+    }
+    skipped
+}
+
+fn record(
+    run: &Finished<'_>,
+    views: &[ExportedView],
+    skipped: &[Skipped],
+    cloud_blake3: BlobKey,
+    points: u64,
+) -> RunRecord {
+    RunRecord {
+        version: CODE_VERSION.to_owned(),
+        numerics_version: NUMERICS_VERSION,
+        scene: run.args.scene.clone(),
+        options: run.prepared.plan.options.clone(),
+        device: run.args.network.device.clone(),
+        weights_blake3: run.prepared.weights_key,
+        weights: run.prepared.weights.metadata().clone(),
+        views: views.iter().map(|view| view.record.clone()).collect(),
+        skipped: skipped.to_vec(),
+        points,
+        cloud_blake3,
+    }
+}
+
+fn report(
+    run: &Finished<'_>,
+    views: &[ExportedView],
+    skipped: &[Skipped],
+    stages: &Stages,
+    points: u64,
+    begun: Instant,
+) -> RunReport {
+    let options = &run.prepared.plan.options;
+    let filter = &options.filter;
+    let settings = [
+        ("network images per depth map", json!(options.views)),
+        ("longest side in pixels", json!(options.max_size)),
+        ("depth hypotheses", options.depths.map_or(json!("by resolution"), |depths| json!(depths))),
+        ("sampling", json!(options.sampling)),
+        ("confidence threshold", json!(filter.min_confidence)),
+        ("views that must agree, reference included", json!(filter.min_views)),
+        ("reprojection threshold in pixels of the depth map", json!(filter.max_reprojection_px)),
+        ("relative depth threshold", json!(filter.max_relative_depth)),
+        ("fusion neighbours", json!(options.fusion_views)),
+        ("device", json!(run.args.network.device)),
+        ("weights", json!(run.args.network.weights)),
+    ];
+    let versions = [
+        ("planesweep", CODE_VERSION.to_owned()),
+        ("numerics", NUMERICS_VERSION.to_string()),
+        ("weights blake3", run.prepared.weights_key.to_string()),
+    ];
+    RunReport {
+        scene: run.args.scene.display().to_string(),
+        settings: settings.map(|(name, value)| (name.to_owned(), value)).into(),
+        versions: versions.map(|(name, value)| (name.to_owned(), value)).into(),
+        stages: stages
+            .iter()
+            .map(|(name, seconds)| StageReport { name: name.clone(), seconds: *seconds })
+            .collect(),
+        views: views.iter().map(|view| view.report.clone()).collect(),
+        skipped: skipped
+            .iter()
+            .map(|s| SkippedView { name: s.view.clone(), reason: s.reason.clone() })
+            .collect(),
+        warnings: run.prepared.input.scene.warnings.clone(),
+        totals: Totals { points, wall_seconds: begun.elapsed().as_secs_f64() },
+    }
+}
+
+fn write_report(
+    out: &OutFolder,
+    report: &RunReport,
+    views: Vec<ExportedView>,
+    points: &[Point],
+) -> Result<()> {
+    out.write_file("report.json", report.to_json().context("cannot write report.json")?.as_bytes())?;
+    let (width, height) = CLOUD_PICTURE;
+    // As the middle view's photographer saw it.
+    let camera: Option<Camera> = views.get(views.len() / 2).map(|view| view.record.depth_camera);
+    let cloud = camera.map(|camera| {
+        let points = points.iter().map(|p| (p.position.map(|v| v as f32), p.color));
+        render_cloud(points, &camera, width, height)
+    });
+    if let Some(cloud) = &cloud {
+        out.write_file("cloud.png", &encode_png(cloud)?)?;
+    }
+    let previews = views.into_iter().map(|view| (view.record.id, view.preview)).collect();
+    out.write_file("report.html", render_html(report, &Pictures { cloud, previews })?.as_bytes())?;
+    Ok(())
+}

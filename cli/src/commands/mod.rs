@@ -1,0 +1,10 @@
+//! One file per command.
+
+pub mod depth;
+pub mod evaluate;
+mod export;
+pub mod inspect;
+pub mod reconstruct;
+pub mod synth;
+pub mod weights;
+pub mod worker;

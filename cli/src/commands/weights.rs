@@ -1,0 +1,68 @@
+//! `planesweep weights import` and `planesweep weights inspect`.
+
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use planesweep_mvsnet::{CostMetric, ImportOptions, Normalization, Weights};
+use planesweep_plan::BlobKey;
+use planesweep_scene::write_atomically;
+use serde_json::json;
+
+use crate::args::{ImportArgs, NormalizationArg, WeightsCommand};
+use crate::console::Outcome;
+use crate::network::read_weights;
+
+/// Imports or inspects.
+pub fn run(command: &WeightsCommand) -> Result<Outcome> {
+    match command {
+        WeightsCommand::Import(args) => import(args),
+        WeightsCommand::Inspect { file } => {
+            let (bytes, weights) = read_weights(file)?;
+            Ok(describe(file, &bytes, &weights))
+        }
+    }
+}
+
+fn import(args: &ImportArgs) -> Result<Outcome> {
+    let name = args.checkpoint.file_name().map(|name| name.to_string_lossy().into_owned());
+    let options = ImportOptions {
+        normalization: match args.normalization {
+            NormalizationArg::Unit => Normalization::UnitRange,
+            NormalizationArg::PerImage => Normalization::PerImage,
+        },
+        metric: CostMetric::Variance,
+        spacing_px: None,
+        source: args.source.clone().or(name).unwrap_or_default(),
+        licence: args.licence.clone(),
+    };
+    let weights = Weights::import(&args.checkpoint, options)?;
+    let bytes = weights.to_bytes();
+    write_atomically(&args.out, &bytes)
+        .with_context(|| format!("cannot write weights {}", args.out.display()))?;
+    Ok(describe(&args.out, &bytes, &weights))
+}
+
+fn describe(file: &Path, bytes: &[u8], weights: &Weights) -> Outcome {
+    let metadata = weights.metadata();
+    let values: usize = weights.tensors().values().map(|tensor| tensor.values.len()).sum();
+    let hash = BlobKey::of(bytes);
+    let text = format!(
+        "{}: {} tensors, {values} values\nblake3         {hash}\nnormalisation  {:?}\nrefinement     {:?}\n\
+         cost metric    {:?}\nsource         {}\nlicence        {}\n",
+        file.display(),
+        weights.tensors().len(),
+        metadata.normalization,
+        metadata.refinement,
+        metadata.metric,
+        metadata.source,
+        metadata.licence,
+    );
+    let value = json!({
+        "file": file,
+        "blake3": hash.to_string(),
+        "tensors": weights.tensors().len(),
+        "values": values,
+        "metadata": metadata,
+    });
+    Outcome { text, value, skipped_views: false }
+}

@@ -1,0 +1,86 @@
+//! `planesweep worker`.
+
+use std::io::Read;
+
+use anyhow::{Context, Result};
+use planesweep_plan::WorkerId;
+use planesweep_proto::{Role, Slots};
+use planesweep_worker::{WorkerConfig, run_worker};
+use serde_json::json;
+use tokio_util::sync::CancellationToken;
+
+use crate::args::{RoleArg, WorkerArgs};
+use crate::console::Outcome;
+use crate::network::backend_factory;
+
+/// One inference runs, the next one loads its images.
+const SLOTS: Slots = Slots { infer: 2, fuse: 2 };
+/// Budget of images, and of depth maps.
+const CACHE_BYTES: u64 = 256 << 20;
+
+/// Works until told to stop.
+pub fn run(args: WorkerArgs) -> Result<Outcome> {
+    let role = match args.role {
+        RoleArg::Infer => Role::Infer,
+        RoleArg::Fuse => Role::Fuse,
+        RoleArg::Both => Role::Both,
+    };
+    let host = read_system("/proc/sys/kernel/hostname").unwrap_or_else(|| "localhost".to_owned());
+    let boot_id = read_system("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+    // A new one for every life of the process: the kernel makes it.
+    let nonce = read_system("/proc/sys/kernel/random/uuid").context("cannot make an id for this worker")?;
+    let config = WorkerConfig {
+        coordinator: args.coordinator,
+        token: args.token,
+        id: WorkerId(format!("{host}-{}-{}", std::process::id(), &nonce[..8.min(nonce.len())])),
+        host,
+        boot_id,
+        role,
+        backend: backend_factory(&args.device)?,
+        device: args.device,
+        slots: SLOTS,
+        cache_bytes: CACHE_BYTES,
+    };
+    let id = config.id.0.clone();
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .context("cannot start the runtime")?;
+    runtime.block_on(async {
+        let stop = CancellationToken::new();
+        stop_on_signal(stop.clone())?;
+        if args.stop_with_stdin {
+            let stop = stop.clone();
+            std::thread::spawn(move || {
+                let mut sink = Vec::new();
+                // Nothing is ever written; the end of the stream is the message.
+                let _ = std::io::stdin().read_to_end(&mut sink);
+                stop.cancel();
+            });
+        }
+        run_worker(config, stop).await.context("the worker ended")
+    })?;
+    // A forward pass cannot be interrupted, so its thread may still run: leave without it.
+    runtime.shutdown_background();
+    Ok(Outcome { text: String::new(), value: json!({ "worker": id }), skipped_views: false })
+}
+
+fn read_system(path: &str) -> Option<String> {
+    std::fs::read_to_string(path).ok().map(|text| text.trim().to_owned())
+}
+
+/// Ctrl-C reaches the whole group of processes; whoever started this one decides what it means.
+fn stop_on_signal(stop: CancellationToken) -> Result<()> {
+    let mut terminate = tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())
+        .context("cannot listen for SIGTERM")?;
+    tokio::spawn(async move {
+        loop {
+            tokio::select! {
+                _ = terminate.recv() => stop.cancel(),
+                _ = tokio::signal::ctrl_c() => {}
+            }
+        }
+    });
+    Ok(())
+}

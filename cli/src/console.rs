@@ -1,0 +1,109 @@
+//! What a command leaves on the terminal.
+
+use std::io::{IsTerminal, stderr};
+use std::time::Duration;
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde_json::Value;
+use tracing_subscriber::EnvFilter;
+
+/// The end of a command that did what was asked.
+pub struct Outcome {
+    /// For people.
+    pub text: String,
+    /// The same for programs (`--json`).
+    pub value: Value,
+    /// Whether views were left out, which makes the exit code 3.
+    pub skipped_views: bool,
+}
+
+/// Sends logs to stderr: warnings, with `-v` more; `PLANESWEEP_LOG` overrides both.
+pub fn start_logging(verbose: u8) {
+    let level = ["warn", "info", "debug", "trace"][usize::from(verbose.min(3))];
+    let filter = EnvFilter::try_from_env("PLANESWEEP_LOG").unwrap_or_else(|_| EnvFilter::new(level));
+    let layer = tracing_subscriber::fmt().with_env_filter(filter).with_writer(stderr);
+    layer.with_ansi(stderr().is_terminal()).without_time().with_target(false).init();
+}
+
+/// Progress of a run: a bar on a terminal, plain lines elsewhere.
+pub struct Progress {
+    bar: ProgressBar,
+    is_terminal: bool,
+    /// Jobs done when the last plain line was printed.
+    printed: u64,
+}
+
+impl Progress {
+    /// Of `total` jobs.
+    pub fn new(total: u64) -> Self {
+        let is_terminal = stderr().is_terminal();
+        let target = if is_terminal { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
+        let bar = ProgressBar::with_draw_target(Some(total), target);
+        let style = "{bar:30} {pos}/{len} jobs  {elapsed} elapsed, {eta} left  {msg}";
+        if let Ok(style) = ProgressStyle::with_template(style) {
+            bar.set_style(style);
+        }
+        bar.enable_steady_tick(Duration::from_millis(200));
+        Self { bar, is_terminal, printed: 0 }
+    }
+
+    /// Shows how far the run is.
+    pub fn show(&mut self, done: u64, message: String) {
+        let total = self.bar.length().unwrap_or(0);
+        self.bar.set_position(done);
+        let step = (total / 20).max(1);
+        if !self.is_terminal && done >= self.printed + step {
+            self.printed = done;
+            eprintln!("{done}/{total} jobs, {:.0} s elapsed, {message}", self.bar.elapsed().as_secs_f64());
+        }
+        self.bar.set_message(message);
+    }
+
+    /// Says something that stays.
+    pub fn say(&self, line: &str) {
+        if self.is_terminal {
+            self.bar.println(line);
+        } else {
+            eprintln!("{line}");
+        }
+    }
+
+    /// Takes the bar away.
+    pub fn finish(&self) {
+        self.bar.finish_and_clear();
+    }
+}
+
+/// Aligns the cells of rows in columns; the first row is the heading.
+pub fn table(rows: &[Vec<String>]) -> String {
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let width = |column: usize| {
+        rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max().unwrap_or(0)
+    };
+    let widths: Vec<usize> = (0..columns).map(width).collect();
+    let mut text = String::new();
+    for row in rows {
+        let mut line = String::new();
+        for (cell, width) in row.iter().zip(&widths) {
+            let padding = " ".repeat(width - cell.chars().count() + 2);
+            line.push_str(cell);
+            line.push_str(&padding);
+        }
+        text.push_str(line.trim_end());
+        text.push('\n');
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_line_up() {
+        let rows = [["view", "size"], ["a", "1152x866"], ["öß", "1"]];
+        let rows: Vec<Vec<String>> =
+            rows.iter().map(|r| r.iter().map(ToString::to_string).collect()).collect();
+        assert_eq!(table(&rows), "view  size\na     1152x866\nöß    1\n");
+    }
+}

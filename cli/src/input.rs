@@ -1,0 +1,80 @@
+//! The scene, with every image read once: what cannot be decoded is left out before planning.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::{Context, Result, bail};
+use planesweep_plan::{BlobKey, Plan};
+use planesweep_scene::{ReadOptions, Scene, ViewId, decode_image, read_scene};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// A view that gets no depth map.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Skipped {
+    /// Its name.
+    pub view: String,
+    /// Why.
+    pub reason: String,
+}
+
+/// A scene whose images can all be decoded.
+pub struct Input {
+    /// Without the views that were left out.
+    pub scene: Scene,
+    /// Hashes of the image files' bytes.
+    pub image_hashes: BTreeMap<ViewId, BlobKey>,
+    /// Views left out so far.
+    pub skipped: Vec<Skipped>,
+}
+
+/// Reads a scene and decodes every image once. A view whose image is damaged is left out, as a
+/// reference and as a source, and named.
+pub fn read(path: &Path, options: &ReadOptions) -> Result<Input> {
+    let mut scene =
+        read_scene(path, options).with_context(|| format!("cannot read the scene {}", path.display()))?;
+    let mut skipped: Vec<Skipped> = scene
+        .skipped
+        .iter()
+        .map(|(view, reason)| Skipped { view: view.clone(), reason: reason.clone() })
+        .collect();
+    let checked: Vec<(ViewId, Result<BlobKey>)> = scene
+        .views
+        .par_iter()
+        .map(|(id, view)| {
+            let check = || {
+                let bytes = std::fs::read(&view.image)
+                    .with_context(|| format!("cannot read image {}", view.image.display()))?;
+                decode_image(&view.image, &bytes)?;
+                Ok(BlobKey::of(&bytes))
+            };
+            (*id, check())
+        })
+        .collect();
+    let mut image_hashes = BTreeMap::new();
+    for (id, result) in checked {
+        match result {
+            Ok(hash) => {
+                image_hashes.insert(id, hash);
+            }
+            Err(error) => {
+                if let Some(view) = scene.views.remove(&id) {
+                    skipped.push(Skipped { view: view.name, reason: format!("{error:#}") });
+                }
+            }
+        }
+    }
+    if scene.views.is_empty() {
+        bail!("no image of {} can be decoded", path.display());
+    }
+    Ok(Input { scene, image_hashes, skipped })
+}
+
+/// All views without a depth map: those left out when reading, and those that the plan skips.
+pub fn all_skipped(input: &Input, plan: &Plan) -> Vec<Skipped> {
+    let planned = plan.skipped.iter().map(|(view, reason)| Skipped {
+        view: input.scene.views[view].name.clone(),
+        reason: reason.to_string(),
+    });
+    input.skipped.iter().cloned().chain(planned).collect()
+}

@@ -1,0 +1,63 @@
+//! From `--weights` and `--device` to a network.
+
+use std::path::Path;
+
+use anyhow::{Context, Result, bail};
+use nalgebra::Vector3;
+use planesweep_mvsnet::{AnalyticBackend, DepthBackend, TorchBackend, Weights};
+use planesweep_plan::Plan;
+use planesweep_worker::BackendFactory;
+
+/// Depth of the plane that the test double knows.
+const ANALYTIC_DEPTH: f64 = 5.0;
+
+/// Reads a weights file and checks that it is one.
+pub fn read_weights(path: &Path) -> Result<(Vec<u8>, Weights)> {
+    let bytes = std::fs::read(path).with_context(|| format!("cannot read weights {}", path.display()))?;
+    let weights =
+        Weights::from_bytes(&bytes).with_context(|| format!("cannot use weights {}", path.display()))?;
+    Ok((bytes, weights))
+}
+
+/// Makes networks on a device, such as "cpu", "cuda" or "cuda:1".
+pub fn backend_factory(device: &str) -> Result<BackendFactory> {
+    if device == "analytic" {
+        return Ok(Box::new(|_, _| Ok(Box::new(AnalyticBackend::new(Vector3::z(), ANALYTIC_DEPTH)))));
+    }
+    if device != "cpu" && device != "cuda" && !device.starts_with("cuda:") {
+        bail!("device \"{device}\" is none of cpu, cuda and cuda:N");
+    }
+    let device = device.to_owned();
+    Ok(Box::new(move |bytes, threads| {
+        let weights = Weights::from_bytes(bytes)?;
+        let backend: Box<dyn DepthBackend> =
+            Box::new(TorchBackend::new(&weights, &device, threads as usize)?);
+        Ok(backend)
+    }))
+}
+
+/// What a worker needs beside the network's volumes.
+const WORKER_BYTES: u64 = 500 << 20;
+/// The plain network's peak, in bytes per voxel of the padded volume: the cost volume of 32 floats
+/// and what is alive beside it.
+const BYTES_PER_VOXEL: u64 = 32 * 4 * 2;
+
+/// As many workers as there are processors, while the memory that is available holds them.
+pub fn default_workers(plan: &Plan) -> u32 {
+    let processors = std::thread::available_parallelism().map_or(1, usize::from) as u64;
+    let voxels = plan.views.iter().map(|view| {
+        let quarter = |side: u32| u64::from(side.next_multiple_of(32) / 4);
+        let (width, height) = view.working_size;
+        quarter(width) * quarter(height) * u64::from(view.hypotheses.count())
+    });
+    let worker_bytes = WORKER_BYTES + BYTES_PER_VOXEL * voxels.max().unwrap_or(0);
+    (available_bytes() / worker_bytes).clamp(1, processors).min(plan.views.len().max(1) as u64) as u32
+}
+
+/// Memory that is free or can be freed, in bytes.
+fn available_bytes() -> u64 {
+    let meminfo = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
+    let line = meminfo.lines().find_map(|line| line.strip_prefix("MemAvailable:"));
+    let kib = line.and_then(|rest| rest.split_whitespace().next()?.parse::<u64>().ok());
+    kib.unwrap_or(0) << 10
+}

@@ -1,0 +1,89 @@
+//! Worker processes on this host: started, watched, replaced when they die, stopped at the end.
+
+use std::process::{ExitStatus, Stdio};
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+use tokio::process::{Child, Command};
+use tokio::task::JoinSet;
+use tokio_util::sync::CancellationToken;
+
+/// A worker that dies at once is not started again at once.
+const RESTART_PAUSE: Duration = Duration::from_millis(500);
+
+/// The workers of one run.
+pub struct Supervisor {
+    slots: JoinSet<()>,
+    orders: Orders,
+}
+
+#[derive(Clone)]
+struct Orders {
+    stop: CancellationToken,
+    kill: CancellationToken,
+}
+
+impl Supervisor {
+    /// Starts `count` workers for the coordinator at `url`.
+    ///
+    /// Each holds the reading end of a pipe from this process, so it notices when this one is gone,
+    /// however that happened.
+    pub fn start(count: u32, url: &str, device: &str) -> Result<Self> {
+        let program = std::env::current_exe().context("cannot find the program to start workers with")?;
+        let orders = Orders { stop: CancellationToken::new(), kill: CancellationToken::new() };
+        let mut slots = JoinSet::new();
+        for slot in 0..count {
+            let mut command = Command::new(&program);
+            command.args(["worker", "--stop-with-stdin", "--coordinator", url, "--device", device]);
+            command.stdin(Stdio::piped()).stdout(Stdio::null()).kill_on_drop(true);
+            slots.spawn(keep_alive(slot, command, orders.clone()));
+        }
+        Ok(Self { slots, orders })
+    }
+
+    /// Tells all workers to end what they do and waits for them; cancelling `at_once` ends them.
+    pub async fn stop(mut self, at_once: &CancellationToken) {
+        self.orders.stop.cancel();
+        loop {
+            tokio::select! {
+                ended = self.slots.join_next() => if ended.is_none() { return },
+                () = at_once.cancelled(), if !self.orders.kill.is_cancelled() => self.orders.kill.cancel(),
+            }
+        }
+    }
+}
+
+/// Runs one worker after the other until told to stop.
+async fn keep_alive(slot: u32, mut command: Command, orders: Orders) {
+    let stop = &orders.stop;
+    while !stop.is_cancelled() {
+        match command.spawn() {
+            Ok(child) => match watch(child, &orders).await {
+                Ok(status) if !stop.is_cancelled() => {
+                    tracing::warn!(slot, %status, "a worker ended before its time, starting another");
+                }
+                Ok(_) => {}
+                Err(error) => tracing::warn!(slot, %error, "cannot watch a worker"),
+            },
+            Err(error) => tracing::warn!(slot, %error, "cannot start a worker"),
+        }
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = tokio::time::sleep(RESTART_PAUSE) => {}
+        }
+    }
+}
+
+async fn watch(mut child: Child, orders: &Orders) -> std::io::Result<ExitStatus> {
+    // `wait` would close the pipe at once.
+    let pipe = child.stdin.take();
+    tokio::select! {
+        status = child.wait() => return status,
+        () = orders.stop.cancelled() => drop(pipe),
+    }
+    tokio::select! {
+        status = child.wait() => return status,
+        () = orders.kill.cancelled() => child.start_kill()?,
+    }
+    child.wait().await
+}
