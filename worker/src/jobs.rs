@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use bytes::Bytes;
-use planesweep_fusion::{FilteredMap, Funnel, emit, encode, filter};
+use planesweep_fusion::{FilteredMap, Funnel, VERTEX_BYTES, emit, encode, filter};
 use planesweep_plan::{BlobKey, FilterSpec, InferSpec, JobSpec};
 use planesweep_proto::{Grant, Input, Success};
 use planesweep_scene::DepthMap;

@@ -61,13 +61,14 @@ pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Out
     let skipped = skipped_views(run);
     let (cloud_key, points) = write_cloud(run, &out)?;
 
+    // Kinds of jobs overlap in time and run on several workers, so these are sums, not parts.
     for kind in ["infer", "filter", "emit", "assemble"] {
         // What an inference waited for the device is not its own time.
         let seconds = |r: &JobResult| r.measurements.get("network_seconds").copied().unwrap_or(r.seconds);
         let seconds = run.results.iter().filter(|r| r.kind == kind).map(seconds).sum();
-        stages.push((format!("of it {kind}, summed over workers"), seconds));
+        stages.push((format!("{kind}, summed"), seconds));
     }
-    stages.push(("write the result".to_owned(), writing.elapsed().as_secs_f64()));
+    stages.push(("write".to_owned(), writing.elapsed().as_secs_f64()));
     let record = record(run, &exported, &skipped, cloud_key, points.len() as u64);
     out.write_file(FILE_NAME, &serde_json::to_vec_pretty(&record).context("cannot write run.json")?)?;
     let report = report(run, &exported, &skipped, &stages, points.len() as u64, begun);

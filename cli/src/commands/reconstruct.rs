@@ -43,8 +43,7 @@ pub fn run(args: &ReconstructArgs, json: bool) -> Result<Outcome> {
     // The workers make their own; this only refuses a wrong name before any work.
     drop(backend_factory(&args.network.device)?);
     let (weights_bytes, weights) = read_weights(&args.network.weights)?;
-    let input =
-        timed(&mut stages, "read and check images", || input::read(&args.scene, &args.read.options()))?;
+    let input = timed(&mut stages, "read images", || input::read(&args.scene, &args.read.options()))?;
     for warning in &input.scene.warnings {
         eprintln!("warning: {warning}");
     }
@@ -136,7 +135,7 @@ async fn compute(
             }
         }
         if missing.is_empty() {
-            stages.push(("depth maps and fusion".to_owned(), begun.elapsed().as_secs_f64()));
+            stages.push(("compute".to_owned(), begun.elapsed().as_secs_f64()));
             if let Some(supervisor) = supervisor.take() {
                 supervisor.stop(&kill).await;
             }
