@@ -1,1 +1,22 @@
-//! What crosses crates: pipeline, cluster and golden tests.
+//! What the tests that cross crates share: the program as a process, scenes, weights, shared data, faults.
+//!
+//! These tests know the program as its users do, by its arguments, its files and its exit codes.
+
+#![warn(missing_docs)]
+#![allow(clippy::missing_panics_doc, reason = "a helper that cannot do its work fails the test")]
+
+mod convert_middlebury;
+mod convert_rgbd;
+mod data;
+mod faults;
+mod program;
+mod results;
+mod scenes;
+
+pub use convert_middlebury::{Bounds, convert_middlebury};
+pub use convert_rgbd::convert_rgbd;
+pub use data::{reference_weights, shared_data, skipped};
+pub use faults::{children, is_alive, send, wait_until};
+pub use program::{Finished, Running, run};
+pub use results::{blobs, confident_share, files_below};
+pub use scenes::{courtyard, plane, seeded_weights};
