@@ -182,8 +182,8 @@ impl Agent {
                 Err(error) if error.is_retryable() => {
                     tracing::warn!(%error, "cannot report to the coordinator, trying again");
                     self.end_lease_if_over();
-                    if self.state != WorkerState::Ready && self.held.held().is_empty() {
-                        // What it had is in the store; the coordinator finds out by the lease.
+                    if self.state != WorkerState::Ready {
+                        // Nobody takes what it still computes; the lease gives the job to another.
                         return Ok(());
                     }
                     pause(reconnect, &mut inbox, &mut self).await;

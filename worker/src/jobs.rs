@@ -159,8 +159,9 @@ impl Jobs {
         let map: FilteredMap =
             decode_filtered_map(&bytes).map_err(|source| JobError::Malformed { job: own.job, source })?;
         let points = compute(move || encode_points(&map.funnel, &encode(&emit(&map)))).await;
-        let count =
-            decode_points(&points).map_err(|source| JobError::Malformed { job: own.job, source })?.len();
+        let vertices =
+            decode_points(&points).map_err(|source| JobError::Malformed { job: own.job, source })?;
+        let count = vertices.len() / VERTEX_BYTES;
         Ok((points, BTreeMap::from([("points".to_owned(), count as f64)])))
     }
 
