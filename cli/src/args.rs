@@ -272,14 +272,21 @@ pub struct DepthArgs {
     #[arg(short, long)]
     pub out: PathBuf,
     /// Write the probability over depth at this pixel of the depth map, too.
-    #[arg(long, value_name = "X,Y", value_delimiter = ',', num_args = 2)]
-    pub probe: Option<Vec<usize>>,
+    #[arg(long, value_name = "X,Y", value_parser = parse_pixel)]
+    pub probe: Option<(usize, usize)>,
     #[command(flatten)]
     pub network: NetworkArgs,
     #[command(flatten)]
     pub plan: PlanArgs,
     #[command(flatten)]
     pub read: ReadArgs,
+}
+
+/// A pixel, column and row, as "X,Y".
+fn parse_pixel(text: &str) -> Result<(usize, usize), String> {
+    let number = |text: &str| text.trim().parse().ok();
+    let pixel = text.split_once(',').and_then(|(x, y)| Some((number(x)?, number(y)?)));
+    pixel.ok_or_else(|| "a pixel is two numbers with a comma between, such as 12,34".to_owned())
 }
 
 /// Arguments of `synth`.
@@ -419,5 +426,13 @@ mod tests {
         assert_eq!((paper.max_size, paper.views, paper.depths), (Some(1920), 5, Some(64)));
         assert_eq!(plan(&["--depth-range", "1", "9.5"]).depth_range, Some((1.0, 9.5)));
         assert_eq!(plan(&[]).max_size, Some(1600));
+    }
+
+    #[test]
+    fn a_pixel_is_two_numbers() {
+        assert_eq!(parse_pixel("12,34"), Ok((12, 34)));
+        for wrong in ["12", "12,", "1,2,3", "-1,2"] {
+            assert!(parse_pixel(wrong).is_err(), "{wrong}");
+        }
     }
 }

@@ -114,11 +114,15 @@ pub fn run<S: AsRef<OsStr>>(arguments: impl IntoIterator<Item = S>) -> Finished 
     Running::start(arguments).wait()
 }
 
-/// The program beside the running test, of the same profile. Cargo builds it where it is missing or
-/// older than its sources; several tests that ask at once wait for one another.
+/// The program that PLANESWEEP_PROGRAM names, or else the one beside the running test, of the same
+/// profile. Cargo builds that where it is missing or older than its sources; several tests that ask at
+/// once wait for one another.
 fn program() -> &'static PathBuf {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
     PROGRAM.get_or_init(|| {
+        if let Some(named) = std::env::var_os("PLANESWEEP_PROGRAM") {
+            return named.into();
+        }
         let test = std::env::current_exe().expect("a test knows its file");
         // target/PROFILE/{deps,examples}/TEST
         let folder = test.ancestors().nth(2).expect("tests lie two folders deep");

@@ -71,9 +71,9 @@ fn infer(args: &DepthArgs, weights: &Weights, input: InferInput<'_>) -> Result<(
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let mut backend = TorchBackend::new(weights, &args.network.device, threads)?;
     let map = backend.infer(input).context("cannot infer the depth map")?;
-    let probability = match args.probe.as_deref() {
-        Some([x, y]) => Some(backend.probability(input, *x, *y).context("cannot probe")?),
-        _ => None,
+    let probability = match args.probe {
+        Some((x, y)) => Some(backend.probability(input, x, y).context("cannot probe")?),
+        None => None,
     };
     Ok((map, probability))
 }
@@ -106,7 +106,7 @@ fn write_probability(
     view: &ViewPlan,
     probability: Option<&[f32]>,
 ) -> Result<Value> {
-    let (Some(probability), Some([x, y])) = (probability, args.probe.as_deref()) else {
+    let (Some(probability), Some((x, y))) = (probability, args.probe) else {
         return Ok(Value::Null);
     };
     let mut csv = "depth,probability\n".to_owned();
