@@ -8,6 +8,12 @@
 
 mod analytic;
 mod backend;
+mod bands;
+mod confidence;
+mod cpu_backend;
+mod feature_cache;
+mod input;
+mod kernels;
 mod weights;
 
 #[cfg(feature = "torch")]
@@ -21,8 +27,6 @@ mod features;
 #[cfg(all(test, feature = "torch"))]
 mod golden;
 #[cfg(feature = "torch")]
-mod input;
-#[cfg(feature = "torch")]
 mod network;
 #[cfg(feature = "torch")]
 mod refine;
@@ -35,6 +39,8 @@ mod warp;
 
 pub use analytic::AnalyticBackend;
 pub use backend::{BackendInfo, DepthBackend, InferError, InferInput};
+pub use bands::{InferCost, InferSize};
+pub use cpu_backend::{CpuBackend, CpuBackendError, InferTimes};
 #[cfg(feature = "torch")]
 pub use torch_backend::{TorchBackend, TorchBackendError};
 pub use weights::{

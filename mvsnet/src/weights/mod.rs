@@ -2,7 +2,6 @@
 
 mod checkpoint;
 mod file;
-#[cfg(feature = "torch")]
 mod folded;
 mod layout;
 mod pickle;
@@ -15,10 +14,9 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 pub use checkpoint::CheckpointError;
-#[cfg(feature = "torch")]
 pub(crate) use folded::{FoldedConvolution, KernelOrder};
 pub use pickle::PickleError;
-#[cfg(all(test, feature = "torch"))]
+#[cfg(test)]
 pub(crate) use seeded::uniform;
 
 /// A hundred times the largest checkpoint of this network.

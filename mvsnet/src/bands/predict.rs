@@ -1,0 +1,100 @@
+//! What an inference will cost, from its sizes alone.
+
+use super::images;
+use crate::input::SIZE_MULTIPLE;
+use crate::kernels::slab::Shape;
+
+/// Sizes of one inference.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct InferSize {
+    /// Columns of the images.
+    pub width: usize,
+    /// Rows of the images.
+    pub height: usize,
+    /// Depth hypotheses.
+    pub depths: usize,
+    /// Views, the reference included.
+    pub views: usize,
+}
+
+/// What it will cost.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct InferCost {
+    /// The most memory that `CpuBackend` holds besides its input and the features of other images.
+    pub bytes: u64,
+    /// Floating-point operations, features of all views included, as the plain network counts them.
+    pub operations: f64,
+}
+
+/// Weights, their packed forms, the threads' stacks and buffers too small to count: measured.
+const FIXED_BYTES: usize = 8 << 20;
+/// Transformed values and the ring of cost columns of one thread, for each depth.
+const THREAD_BYTES_PER_DEPTH: usize = 7 * 32 * 4 + 8 * 36 + 16 * 4;
+/// The same, whatever the depths.
+const THREAD_BYTES: usize = 512 << 10;
+/// Operations of the features, for each pixel of an image.
+const FEATURE_OPERATIONS: f64 = 9248.0;
+/// Operations of warp and variance, for each voxel and source: bilinear weights, sums, squares in 32 channels.
+const WARP_OPERATIONS: f64 = 32.0 * 11.0;
+/// Operations of the 3D network, for each voxel.
+const VOLUME_OPERATIONS: f64 = 20_304.0;
+
+/// The cost of an inference with all its rows, `step_rows` rows of the volume at a time.
+pub(crate) fn predict(size: InferSize, threads: usize, step_rows: usize) -> InferCost {
+    let InferSize { depths, views, .. } = size;
+    let (width, height) =
+        (size.width.next_multiple_of(SIZE_MULTIPLE), size.height.next_multiple_of(SIZE_MULTIPLE));
+    let pixels = width * height;
+    let maps = views * (width / 4 + 2) * (height / 4 + 2) * 32 * 4;
+    let images = images::features_bytes(width, height) + 3 * pixels * 4;
+    let volume = volume_bytes(width / 4, height / 4, depths, step_rows);
+    let pixel_bytes = pixels / 16 * 40;
+    let threads = threads * (THREAD_BYTES + THREAD_BYTES_PER_DEPTH * depths);
+    let bytes = FIXED_BYTES + threads + maps + images.max(volume + pixel_bytes);
+    let voxels = (pixels / 16 * depths) as f64;
+    let operations = FEATURE_OPERATIONS * (pixels * views) as f64
+        + voxels * (VOLUME_OPERATIONS + WARP_OPERATIONS * (views as f64 - 1.0));
+    InferCost { bytes: bytes as u64, operations }
+}
+
+/// Bytes of the slabs that the 3D network takes from its pool.
+///
+/// Follows how many rows each stage has taken and given: a row is held from when it begins to when the
+/// transposed layer has added it to its output.
+pub(crate) fn volume_bytes(width: usize, height: usize, depths: usize, step_rows: usize) -> usize {
+    let plain = |taken: usize, height: usize| if taken == height { taken } else { taken.saturating_sub(1) };
+    let up = |taken: usize, height: usize| {
+        if taken == height { 2 * taken } else { (2 * taken).saturating_sub(1) }
+    };
+    let begun = |taken: usize, height: usize| if taken == 0 { 0 } else { (taken + 1).min(height) };
+    let heights = [height, height / 2, height / 4, height / 8];
+    let mut most = [0; 4];
+    // Rows taken by the plain layer of each scale, and rows given by the layer that comes back to it.
+    let (mut taken, mut given) = ([0; 4], [0; 4]);
+    while taken[0] < height {
+        let (taken_before, given_before) = (taken, given);
+        taken[0] = (taken[0] + step_rows).min(height);
+        for scale in 1..4 {
+            taken[scale] = plain(taken[scale - 1], heights[scale - 1]) / 2;
+        }
+        given[3] = plain(taken[3], heights[3]);
+        for scale in (0..3).rev() {
+            given[scale] = up(given[scale + 1], heights[scale + 1]);
+        }
+        for scale in 0..4 {
+            let held = begun(taken[scale], heights[scale]) - given_before[scale];
+            // What the strided layer gave is held until the plain layer has taken it, and what the
+            // transposed layer gives is held beside its skips, with what the next stage keeps.
+            let coming = if scale == 0 { 0 } else { taken[scale] - taken_before[scale] };
+            let going = if scale == 3 { 0 } else { given[scale] - given_before[scale] };
+            let kept = if scale == 0 { 2 } else { 1 };
+            most[scale] = most[scale].max(held + coming.max(going) + kept.min(given_before[scale]));
+        }
+    }
+    let shape = |scale: usize| Shape {
+        columns: width >> scale,
+        channels: 8 << scale,
+        length: (0..scale).fold(depths, |depths, _| depths.div_ceil(2)),
+    };
+    (0..4).map(|scale| most[scale] * shape(scale).bytes()).sum()
+}
