@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use planesweep_fusion::FilterOptions;
+use planesweep_fusion::{DepthSampling, FilterOptions};
 use planesweep_plan::{PlanOptions, SamplingChoice};
 use planesweep_scene::{DepthLine, PixelCentre, ReadOptions};
 
@@ -138,8 +138,8 @@ pub struct PlanArgs {
     #[arg(long, value_enum, default_value = "auto")]
     pub sampling: SamplingArg,
     /// Nearest and farthest depth of every view, in scene units; by default the sparse points decide.
-    #[arg(long, num_args = 2, value_names = ["NEAR", "FAR"])]
-    pub depth_range: Option<Vec<f64>>,
+    #[arg(long, value_name = "NEAR,FAR", value_parser = depth_range)]
+    pub depth_range: Option<(f64, f64)>,
 }
 
 /// [`SamplingChoice`] on the command line.
@@ -158,21 +158,47 @@ pub enum SamplingArg {
 #[command(next_help_heading = "Fusion")]
 pub struct FilterArgs {
     /// Drop pixels with less confidence.
-    #[arg(long, default_value_t = 0.8)]
+    #[arg(long, default_value_t = 0.8, value_parser = share)]
     pub min_confidence: f32,
     /// Views that must agree on a depth, the reference included. The paper says three; scripts that
     /// ask for three source views mean 4 here.
-    #[arg(long, default_value_t = 3)]
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=255))]
     pub min_views: u32,
     /// Largest reprojection error, in pixels of the depth map.
-    #[arg(long, default_value_t = 1.0)]
+    #[arg(long, default_value_t = 1.0, value_parser = positive)]
     pub max_reprojection: f32,
     /// Largest relative difference of depths.
-    #[arg(long, default_value_t = 0.01)]
+    #[arg(long, default_value_t = 0.01, value_parser = positive)]
     pub max_depth_difference: f32,
+    /// Read a neighbour's depth between its pixels only where these are valid and continuous, instead
+    /// of plainly bilinear as the common scripts do.
+    #[arg(long)]
+    pub continuous: bool,
     /// Views that a depth map is checked against.
-    #[arg(long, default_value_t = 10)]
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub fusion_views: u32,
+}
+
+fn share(text: &str) -> Result<f32, String> {
+    let value: f32 = text.parse().map_err(|_| format!("{text} is not a number"))?;
+    if (0.0..=1.0).contains(&value) { Ok(value) } else { Err(format!("{text} is not from 0 to 1")) }
+}
+
+fn positive(text: &str) -> Result<f32, String> {
+    let value: f32 = text.parse().map_err(|_| format!("{text} is not a number"))?;
+    if value > 0.0 && value.is_finite() { Ok(value) } else { Err(format!("{text} is not positive")) }
+}
+
+/// Two depths, `NEAR,FAR`.
+fn depth_range(text: &str) -> Result<(f64, f64), String> {
+    let number = |text: &str| text.trim().parse::<f64>().map_err(|_| format!("{text} is not a number"));
+    let (near, far) = text.split_once(',').ok_or("two depths are needed: NEAR,FAR")?;
+    let (near, far) = (number(near)?, number(far)?);
+    if near > 0.0 && far > near && far.is_finite() {
+        Ok((near, far))
+    } else {
+        Err(format!("{near} to {far} is not positive and increasing"))
+    }
 }
 
 impl PlanArgs {
@@ -194,13 +220,13 @@ impl PlanArgs {
                 SamplingArg::Uniform => SamplingChoice::Uniform,
                 SamplingArg::Inverse => SamplingChoice::Inverse,
             },
-            depth_range: self.depth_range.as_deref().and_then(|r| Some((*r.first()?, *r.get(1)?))),
+            depth_range: self.depth_range,
             filter: filter.map_or(defaults.filter, |f| FilterOptions {
                 min_confidence: f.min_confidence,
                 min_views: f.min_views,
                 max_reprojection_px: f.max_reprojection,
                 max_relative_depth: f.max_depth_difference,
-                ..defaults.filter
+                sampling: if f.continuous { DepthSampling::Continuous } else { DepthSampling::Bilinear },
             }),
             threads: defaults.threads,
         }
@@ -255,6 +281,8 @@ pub struct InspectArgs {
     pub scene: PathBuf,
     #[command(flatten)]
     pub plan: PlanArgs,
+    #[command(flatten)]
+    pub filter: FilterArgs,
     #[command(flatten)]
     pub read: ReadArgs,
 }
@@ -424,8 +452,21 @@ mod tests {
         };
         let paper = plan(&["--quality", "paper", "--depths", "64"]);
         assert_eq!((paper.max_size, paper.views, paper.depths), (Some(1920), 5, Some(64)));
-        assert_eq!(plan(&["--depth-range", "1", "9.5"]).depth_range, Some((1.0, 9.5)));
+        assert_eq!(plan(&["--depth-range", "1,9.5"]).depth_range, Some((1.0, 9.5)));
         assert_eq!(plan(&[]).max_size, Some(1600));
+    }
+
+    #[test]
+    fn senseless_numbers_are_usage_errors() {
+        let refused = |option: &str, value: &str| {
+            let option = format!("{option}={value}");
+            let args = ["planesweep", "reconstruct", "s", "-o", "o", "--weights", "w", &option];
+            Cli::try_parse_from(args).is_err()
+        };
+        assert!(refused("--depth-range", "9,1") && refused("--depth-range", "0,1"));
+        assert!(refused("--min-views", "0") && refused("--min-confidence", "nan"));
+        assert!(refused("--max-reprojection", "-1") && refused("--max-depth-difference", "inf"));
+        assert!(!refused("--min-confidence", "0.5"));
     }
 
     #[test]

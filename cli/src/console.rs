@@ -54,7 +54,8 @@ impl Progress {
         let step = (total / 20).max(1);
         if !self.is_terminal && done >= self.printed + step {
             self.printed = done;
-            eprintln!("{done}/{total} jobs, {:.0} s elapsed, {message}", self.bar.elapsed().as_secs_f64());
+            let (elapsed, left) = (self.bar.elapsed().as_secs_f64(), self.bar.eta().as_secs_f64());
+            eprintln!("{done}/{total} jobs, {elapsed:.0} s elapsed, {left:.0} s left, {message}");
         }
         self.bar.set_message(message);
     }

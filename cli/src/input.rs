@@ -31,8 +31,10 @@ pub struct Input {
 /// Reads a scene and decodes every image once. A view whose image is damaged is left out, as a
 /// reference and as a source, and named.
 pub fn read(path: &Path, options: &ReadOptions) -> Result<Input> {
+    // Workers, and runs that resume, may have another working folder.
+    let root = path.canonicalize().with_context(|| format!("cannot find the scene {}", path.display()))?;
     let mut scene =
-        read_scene(path, options).with_context(|| format!("cannot read the scene {}", path.display()))?;
+        read_scene(&root, options).with_context(|| format!("cannot read the scene {}", path.display()))?;
     let mut skipped: Vec<Skipped> = scene
         .skipped
         .iter()

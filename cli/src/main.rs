@@ -12,6 +12,7 @@ mod out_folder;
 mod run_record;
 mod supervisor;
 
+use std::io::{Write, stdout};
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -24,7 +25,7 @@ fn main() -> ExitCode {
     console::start_logging(cli.verbose);
     let json = cli.json;
     let done = match cli.command {
-        Command::Reconstruct(args) => commands::reconstruct::run(&args, json),
+        Command::Reconstruct(args) => commands::reconstruct::run(&args, json, cli.verbose),
         Command::Inspect(args) => commands::inspect::run(&args),
         Command::Depth(args) => commands::depth::run(&args),
         Command::Synth(args) => commands::synth::run(&args),
@@ -34,16 +35,13 @@ fn main() -> ExitCode {
     };
     match done {
         Ok(Outcome { text, value, skipped_views }) => {
-            if json {
-                println!("{value}");
-            } else {
-                print!("{text}");
-            }
+            // A closed pipe (`planesweep inspect ... | head`) is no failure.
+            let _ = if json { writeln!(stdout(), "{value}") } else { write!(stdout(), "{text}") };
             if skipped_views { ExitCode::from(3) } else { ExitCode::SUCCESS }
         }
         Err(error) => {
             if json {
-                println!("{}", serde_json::json!({ "error": format!("{error:#}") }));
+                let _ = writeln!(stdout(), "{}", serde_json::json!({ "error": format!("{error:#}") }));
             }
             eprintln!("planesweep: {error:#}");
             ExitCode::FAILURE

@@ -8,8 +8,18 @@ use planesweep_mvsnet::{AnalyticBackend, DepthBackend, TorchBackend, Weights};
 use planesweep_plan::Plan;
 use planesweep_worker::BackendFactory;
 
+/// The device of the test double.
+const ANALYTIC: &str = "analytic";
 /// Depth of the plane that the test double knows.
 const ANALYTIC_DEPTH: f64 = 5.0;
+
+/// What stands for the weights of the test double, so that its results are never taken for real ones.
+const ANALYTIC_WEIGHTS: &[u8] = b"analytic backend";
+
+/// The bytes that the device loads its network from.
+pub fn weights_for(device: &str, weights: Vec<u8>) -> Vec<u8> {
+    if device == ANALYTIC { ANALYTIC_WEIGHTS.to_vec() } else { weights }
+}
 
 /// Reads a weights file and checks that it is one.
 pub fn read_weights(path: &Path) -> Result<(Vec<u8>, Weights)> {
@@ -21,7 +31,7 @@ pub fn read_weights(path: &Path) -> Result<(Vec<u8>, Weights)> {
 
 /// Makes networks on a device, such as "cpu", "cuda" or "cuda:1".
 pub fn backend_factory(device: &str) -> Result<BackendFactory> {
-    if device == "analytic" {
+    if device == ANALYTIC {
         return Ok(Box::new(|_, _| Ok(Box::new(AnalyticBackend::new(Vector3::z(), ANALYTIC_DEPTH)))));
     }
     if device != "cpu" && device != "cuda" && !device.starts_with("cuda:") {
@@ -54,10 +64,17 @@ pub fn default_workers(plan: &Plan) -> u32 {
     (available_bytes() / worker_bytes).clamp(1, processors).min(plan.views.len().max(1) as u64) as u32
 }
 
-/// Memory that is free or can be freed, in bytes.
+/// Memory that is free or can be freed, in bytes: the machine's, or the container's where that is less.
 fn available_bytes() -> u64 {
     let meminfo = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
     let line = meminfo.lines().find_map(|line| line.strip_prefix("MemAvailable:"));
     let kib = line.and_then(|rest| rest.split_whitespace().next()?.parse::<u64>().ok());
-    kib.unwrap_or(0) << 10
+    let machine = kib.unwrap_or(0) << 10;
+    let cgroup = |file: &str| -> Option<u64> {
+        std::fs::read_to_string(format!("/sys/fs/cgroup/{file}")).ok()?.trim().parse().ok()
+    };
+    match (cgroup("memory.max"), cgroup("memory.current")) {
+        (Some(limit), Some(used)) => machine.min(limit.saturating_sub(used)),
+        _ => machine,
+    }
 }

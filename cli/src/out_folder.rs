@@ -16,13 +16,30 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use planesweep_report::{PreviewOptions, draw_preview, encode_png};
 use planesweep_scene::{
-    Camera, DepthHypotheses, DepthMap, DepthRange, Raster, ViewId, write_atomically, write_pfm,
+    Camera, DepthHypotheses, DepthMap, DepthRange, Raster, Sampling, ViewId, write_atomically, write_pfm,
 };
+
+/// All that a run writes, the cloud first and the record last: while anything is left of an earlier
+/// run, its record says so.
+const WRITTEN: [&str; 11] = [
+    "cloud.ply",
+    "cloud.png",
+    "report.html",
+    "report.json",
+    "depth",
+    "confidence",
+    "preview",
+    "cams",
+    "pair.txt",
+    "trajectory.log",
+    crate::run_record::FILE_NAME,
+];
 
 /// A folder for results, with a file name for every view.
 pub struct OutFolder {
@@ -57,6 +74,25 @@ impl OutFolder {
         Ok(Self { root: root.to_owned(), names })
     }
 
+    /// Removes what an earlier run left, so that no file of it is taken for one of this run. Does
+    /// nothing in a folder that no run has written to.
+    pub fn clear(&self) -> Result<()> {
+        if !self.root.join(crate::run_record::FILE_NAME).exists() {
+            return Ok(());
+        }
+        let remove = |name: &str| {
+            let path = self.root.join(name);
+            let removed = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+            match removed {
+                Err(error) if error.kind() != ErrorKind::NotFound => {
+                    Err(error).with_context(|| format!("cannot remove {}", path.display()))
+                }
+                _ => Ok(()),
+            }
+        };
+        WRITTEN.iter().try_for_each(|name| remove(name))
+    }
+
     /// The folder itself.
     pub fn root(&self) -> &Path {
         &self.root
@@ -75,14 +111,16 @@ impl OutFolder {
         view: ViewId,
         map: &DepthMap,
         kept: &Raster<bool>,
-        range: &DepthRange,
+        hypotheses: &DepthHypotheses,
     ) -> Result<MapFiles> {
         let name = self.names.get(&view).context("the view has no name")?;
         let depth = self.path(&format!("depth/{name}.pfm"))?;
         write_pfm(&depth, &map.depth)?;
         let confidence = self.path(&format!("confidence/{name}.pfm"))?;
         write_pfm(&confidence, &map.confidence)?;
-        let picture = draw_preview(map, kept, range, &PreviewOptions::default())?;
+        let inverse_depth = hypotheses.sampling() == Sampling::Inverse;
+        let options = PreviewOptions { inverse_depth, ..PreviewOptions::default() };
+        let picture = draw_preview(map, kept, &depth_range(hypotheses), &options)?;
         let preview_name = format!("preview/{name}.png");
         let preview = self.write_file(&preview_name, &encode_png(&picture)?)?;
         Ok(MapFiles { depth, confidence, preview, preview_name, picture })

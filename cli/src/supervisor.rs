@@ -10,6 +10,8 @@ use tokio_util::sync::CancellationToken;
 
 /// A worker that dies at once is not started again at once.
 const RESTART_PAUSE: Duration = Duration::from_millis(500);
+/// How long a worker may take to go when nothing is left to do; one that takes longer is frozen.
+const LAST_GRACE: Duration = Duration::from_secs(10);
 
 /// The workers of one run.
 pub struct Supervisor {
@@ -28,17 +30,31 @@ impl Supervisor {
     ///
     /// Each holds the reading end of a pipe from this process, so it notices when this one is gone,
     /// however that happened.
-    pub fn start(count: u32, url: &str, device: &str) -> Result<Self> {
+    pub fn start(count: u32, url: &str, device: &str, verbose: u8) -> Result<Self> {
         let program = std::env::current_exe().context("cannot find the program to start workers with")?;
         let orders = Orders { stop: CancellationToken::new(), kill: CancellationToken::new() };
         let mut slots = JoinSet::new();
         for slot in 0..count {
             let mut command = Command::new(&program);
             command.args(["worker", "--stop-with-stdin", "--coordinator", url, "--device", device]);
+            command.args(std::iter::repeat_n("-v", verbose.into()));
             command.stdin(Stdio::piped()).stdout(Stdio::null()).kill_on_drop(true);
             slots.spawn(keep_alive(slot, command, orders.clone()));
         }
         Ok(Self { slots, orders })
+    }
+
+    /// Stops the workers of a run that is finished: they have nothing left to do, so one that does not
+    /// go is ended.
+    pub async fn finish(self, at_once: &CancellationToken) {
+        let at_once = at_once.child_token();
+        let too_late = at_once.clone();
+        let grace = tokio::spawn(async move {
+            tokio::time::sleep(LAST_GRACE).await;
+            too_late.cancel();
+        });
+        self.stop(&at_once).await;
+        grace.abort();
     }
 
     /// Tells all workers to end what they do and waits for them; cancelling `at_once` ends them.

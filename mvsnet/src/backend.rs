@@ -74,14 +74,17 @@ pub trait DepthBackend {
     fn infer(&mut self, input: InferInput<'_>) -> Result<DepthMap, InferError>;
 }
 
-/// The camera of an image's depth map, and the image's colours there: the pixel at column and row `4u`,
-/// on which the strided layers centre their pixel `u`.
+/// The camera of an image's depth map, whose pixel `u` is centred on image pixel `4u`.
+pub(crate) fn quarter_camera(image: &WorkingImage) -> Camera {
+    let (width, height) = (image.pixels.width() as u32, image.pixels.height() as u32);
+    Camera { intrinsics: image.camera.intrinsics.with_size(width, height).quartered(), ..image.camera }
+}
+
+/// The camera of an image's depth map, and the image's colours there.
 pub(crate) fn quarter(image: &WorkingImage) -> (Camera, Raster<[u8; 3]>) {
-    let pixels = &image.pixels;
-    let size = image.camera.intrinsics.with_size(pixels.width() as u32, pixels.height() as u32);
-    let camera = Camera { intrinsics: size.quartered(), ..image.camera };
-    let (width, height) = (pixels.width().div_ceil(4), pixels.height().div_ceil(4));
-    (camera, Raster::from_fn(width, height, |x, y| pixels.at(4 * x, 4 * y)))
+    let camera = quarter_camera(image);
+    let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
+    (camera, image.map_colors(width, height))
 }
 
 /// What holds for every backend.

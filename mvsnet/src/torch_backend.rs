@@ -4,7 +4,7 @@ use planesweep_scene::{DepthMap, Raster, WorkingImage};
 use tch::{Cuda, Device, Kind, TchError, Tensor};
 use thiserror::Error;
 
-use crate::backend::quarter;
+use crate::backend::{quarter, quarter_camera};
 use crate::depth;
 use crate::input::InputImage;
 use crate::network::{FeatureView, Inference, Network, StepError};
@@ -120,7 +120,7 @@ impl TorchBackend {
 
     fn view(&self, image: &WorkingImage, pixels: &Tensor) -> Result<FeatureView, StepError> {
         let features = self.network.features(pixels)?;
-        Ok(FeatureView { features, projection: quarter(image).0.projection() })
+        Ok(FeatureView { features, projection: quarter_camera(image).projection() })
     }
 
     fn error(&self, doing: &'static str, error: &TchError) -> InferError {

@@ -15,6 +15,8 @@ const MARGIN: f64 = 0.05;
 pub const MIN_POINTS: usize = 20;
 /// Hypotheses come in multiples of this, because the network halves the depth axis three times.
 pub const DEPTH_MULTIPLE: u32 = 8;
+/// More hypotheses than this are not taken from any file.
+pub const MOST_DEPTHS: u32 = 4096;
 /// From this ratio of the far to the near end on, inverse sampling is chosen.
 const INVERSE_FROM_RATIO: f64 = 3.0;
 
@@ -77,7 +79,12 @@ pub fn hypotheses(
         let pixels = steps[steps.len() / 2].round().clamp(MIN_DEPTHS as f64, MAX_DEPTHS as f64);
         pixels as u32
     });
-    DepthHypotheses::new(sampling, range.min, range.max, count.next_multiple_of(DEPTH_MULTIPLE))
+    DepthHypotheses::new(
+        sampling,
+        range.min,
+        range.max,
+        count.min(MOST_DEPTHS).next_multiple_of(DEPTH_MULTIPLE),
+    )
 }
 
 /// How many pixels of the source image the whole range would span, at the rate at which the

@@ -5,6 +5,7 @@ use std::fmt;
 
 use nalgebra::Point3;
 use planesweep_scene::{Camera, DepthHypotheses, DepthRange, Scene, ViewId};
+use rayon::iter::Either;
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -64,6 +65,8 @@ pub enum SkipReason {
     Isolated,
     /// Neither it nor its neighbours see enough sparse points, and no range was given.
     NoDepthRange,
+    /// Its depth range cannot be divided into hypotheses.
+    BadDepthRange,
 }
 
 impl fmt::Display for SkipReason {
@@ -71,6 +74,7 @@ impl fmt::Display for SkipReason {
         f.write_str(match self {
             Self::Isolated => "isolated: shares nothing with the other views",
             Self::NoDepthRange => "no depth range: too few sparse points in it and its neighbours",
+            Self::BadDepthRange => "its depth range cannot be divided into hypotheses",
         })
     }
 }
@@ -102,7 +106,7 @@ pub fn plan(scene: &Scene, options: &PlanOptions) -> Plan {
     let mut neighbours = symmetric_neighbours(&ranking, options.fusion_views as usize);
 
     let order = order_views(&ranking);
-    let view_plans = order.into_par_iter().filter_map(|view| {
+    let planned = order.into_par_iter().map(|view| {
         let (range, origin) = ranges[&view];
         let best: Vec<ViewId> =
             sources[&view].iter().map(|s| s.view).take(options.views.max(2) as usize - 1).collect();
@@ -110,10 +114,10 @@ pub fn plan(scene: &Scene, options: &PlanOptions) -> Plan {
         let reference = working(view);
         let sampling = choose_sampling(options.sampling, &range);
         let points = seen.get(&view).map_or(&[][..], Vec::as_slice);
-        let hypotheses =
-            hypotheses(&reference, &working(best[0]), points, &range, sampling, options.depths).ok()?;
+        let hypotheses = hypotheses(&reference, &working(best[0]), points, &range, sampling, options.depths);
         let working_size = (reference.intrinsics.width, reference.intrinsics.height);
-        Some(ViewPlan {
+        let hypotheses = hypotheses.map_err(|_| view)?;
+        Ok(ViewPlan {
             view,
             sources: best,
             neighbours: Vec::new(),
@@ -122,9 +126,15 @@ pub fn plan(scene: &Scene, options: &PlanOptions) -> Plan {
             working_size,
         })
     });
-    let mut views: Vec<ViewPlan> = view_plans.collect();
+    let (mut views, refused): (Vec<ViewPlan>, Vec<ViewId>) =
+        planned.partition_map(|view: Result<ViewPlan, ViewId>| match view {
+            Ok(view) => Either::Left(view),
+            Err(view) => Either::Right(view),
+        });
+    skipped.extend(refused.into_iter().map(|view| (view, SkipReason::BadDepthRange)));
     for view in &mut views {
         view.neighbours = neighbours.remove(&view.view).unwrap_or_default();
+        view.neighbours.retain(|neighbour| !skipped.contains_key(neighbour));
     }
     Plan { options: options.clone(), views, skipped }
 }
@@ -262,6 +272,21 @@ mod tests {
         assert_eq!((view.hypotheses.count(), view.hypotheses.sampling()), (96, Sampling::Inverse));
         assert_eq!(view.range_origin, RangeOrigin::Option);
         assert_eq!(view.working_size, (160, 120));
+    }
+
+    #[test]
+    fn a_range_that_cannot_be_divided_is_named() {
+        let mut scene = scene();
+        let tiny = DepthRange { min: f64::MIN_POSITIVE, max: f64::MAX, count: Some(1) };
+        scene.views.get_mut(&ViewId(3)).expect("exists").depth_range = Some(tiny);
+        let options = PlanOptions { sampling: crate::SamplingChoice::Uniform, ..PlanOptions::default() };
+        let plan = plan(&scene, &options);
+        assert_eq!(plan.views.len() + plan.skipped.len(), scene.views.len());
+        let absurd = DepthRange { min: 1.0, max: 2.0, count: Some(u32::MAX) };
+        scene.views.get_mut(&ViewId(3)).expect("exists").depth_range = Some(absurd);
+        let plan = super::plan(&scene, &options);
+        let view = plan.views.iter().find(|v| v.view == ViewId(3)).expect("planned");
+        assert_eq!(view.hypotheses.count(), crate::depth_range::MOST_DEPTHS);
     }
 
     #[test]

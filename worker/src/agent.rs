@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 
 use planesweep_plan::{NUMERICS_VERSION, WorkerId};
 use planesweep_proto::{
-    CODE_VERSION, Client, Grant, JobAttempt, Order, Outcome, PROTOCOL_VERSION, Report, ReportReply, Role,
-    ServiceError, Slots, WorkerState,
+    CODE_VERSION, Client, Failure, Grant, JobAttempt, Order, Outcome, PROTOCOL_VERSION, Report, ReportReply,
+    Role, ServiceError, Slots, WorkerState,
 };
 use thiserror::Error;
 use tokio::sync::mpsc;
@@ -69,6 +69,12 @@ pub enum WorkerError {
     /// The store cannot be opened.
     #[error("cannot reach the results")]
     Store(#[from] StoreError),
+    /// The device cannot run the network, or its thread has ended.
+    #[error("the device is out of order: {message}")]
+    BrokenDevice {
+        /// Why.
+        message: String,
+    },
     /// The thread of the device cannot be started.
     #[error("cannot start the thread of the device")]
     Device(#[source] std::io::Error),
@@ -101,6 +107,7 @@ pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result
         unopened: Some((device, config.cache_bytes)),
         max_wait: FIRST_WAIT,
         lease_ends: None,
+        broken: None,
     };
     agent.run(inbox, stop).await
 }
@@ -117,6 +124,8 @@ struct Identity {
 enum Event {
     Started(JobAttempt),
     Finished(JobAttempt, Outcome),
+    /// The job ended for the device is out of order.
+    Broken(JobAttempt, Failure),
 }
 
 struct Agent {
@@ -134,6 +143,8 @@ struct Agent {
     unopened: Option<(Device, u64)>,
     max_wait: Duration,
     lease_ends: Option<Instant>,
+    /// Why the device can do no further job.
+    broken: Option<String>,
 }
 
 impl Agent {
@@ -175,7 +186,14 @@ impl Agent {
                     if order == Order::Drain {
                         self.drain();
                     }
-                    if !brought_something && sent.elapsed() < SHORTEST_PAUSE {
+                    if let Some(message) = self.broken.take() {
+                        // Its end was reported; whoever started this worker may start another.
+                        return Err(WorkerError::BrokenDevice { message });
+                    }
+                    if self.state != WorkerState::Ready {
+                        // The coordinator holds no reply back for a worker that takes no jobs.
+                        pause(self.max_wait.max(SHORTEST_PAUSE), &mut inbox, &mut self).await;
+                    } else if !brought_something && sent.elapsed() < SHORTEST_PAUSE {
                         pause(SHORTEST_PAUSE, &mut inbox, &mut self).await;
                     }
                 }
@@ -249,25 +267,33 @@ impl Agent {
         self.tasks.insert(attempt, cancelled.clone());
         let events = self.events.clone();
         tokio::spawn(async move {
-            let job = &grant.job.to_string()[..12];
+            let job = grant.job.to_string()[..12].to_owned();
             let (kind, view) = (grant.spec.kind(), grant.spec.view().map(|v| v.0));
             // The receiver lives as long as the loop; without it nobody needs to know.
             let begun = events.clone();
             let started = move || drop(begun.try_send(Event::Started(attempt)));
-            let outcome = match jobs.run(&grant, &cancelled, started).await {
+            // On a task of its own, so that a panic ends the job and not the news of it.
+            let run = tokio::spawn(async move { jobs.run(&grant, &cancelled, started).await });
+            let result =
+                run.await.unwrap_or_else(|panic| Err(JobError::Panicked { message: panic.to_string() }));
+            let event = match result {
                 Ok(success) => {
                     tracing::debug!(job, kind, view, seconds = success.seconds, "done");
-                    Outcome::Success(success)
+                    Event::Finished(attempt, Outcome::Success(success))
                 }
                 Err(error) => {
                     let failure = error.to_failure();
                     if !matches!(error, JobError::GivenUp) {
                         tracing::warn!(job, kind, view, code = failure.code, "{}", failure.message);
                     }
-                    Outcome::Failure(failure)
+                    if error.is_fatal() {
+                        Event::Broken(attempt, failure)
+                    } else {
+                        Event::Finished(attempt, Outcome::Failure(failure))
+                    }
                 }
             };
-            let _ = events.send(Event::Finished(attempt, outcome)).await;
+            let _ = events.send(event).await;
         });
     }
 
@@ -277,6 +303,11 @@ impl Agent {
             Event::Finished(attempt, outcome) => {
                 self.tasks.remove(&attempt);
                 self.held.finish(attempt, outcome);
+            }
+            Event::Broken(attempt, failure) => {
+                self.tasks.remove(&attempt);
+                self.broken = Some(failure.message.clone());
+                self.held.finish(attempt, Outcome::Failure(failure));
             }
         }
     }

@@ -29,6 +29,12 @@ pub enum JobError {
         #[source]
         source: StoreError,
     },
+    /// Results of needed jobs are gone or damaged.
+    #[error("the results of {} needed jobs are no longer in the store", jobs.len())]
+    Lost {
+        /// The needed jobs.
+        jobs: Vec<JobId>,
+    },
     /// The result of a needed job is not what it must be.
     #[error("the result of job {job} makes no sense")]
     Malformed {
@@ -50,6 +56,12 @@ pub enum JobError {
     /// No view gave a point.
     #[error(transparent)]
     EmptyCloud(#[from] EmptyCloud),
+    /// The code panicked: a bug.
+    #[error("the job panicked: {message}")]
+    Panicked {
+        /// What the panic said.
+        message: String,
+    },
     /// The job was taken back before it was done.
     #[error("given up: the worker is stopping or its lease is over")]
     GivenUp,
@@ -62,26 +74,35 @@ impl JobError {
             // The bytes are fixed by their hash, so another try sees the same.
             Self::Image(ImagesError::Read { .. }) => ("image-read", true, true),
             Self::Image(_) => ("image", false, true),
-            Self::Device(DeviceError::Load { .. }) => ("load", false, true),
+            // The device is the worker's trouble, not the job's: the worker goes, see `is_fatal`.
+            Self::Device(DeviceError::Load { .. }) => ("load", true, false),
             Self::Device(DeviceError::Infer(InferError::OutOfMemory { .. })) => ("out-of-memory", true, true),
             Self::Device(DeviceError::Infer(InferError::Library { .. })) => ("library", true, true),
             Self::Device(DeviceError::Infer(_)) => ("infer", false, true),
             Self::Device(DeviceError::Gone) => ("device-gone", true, true),
-            Self::Input { source, .. } if source.is_lost() => ("input-lost", true, false),
+            Self::Lost { .. } => ("input-lost", true, false),
             Self::Malformed { .. } => ("input-malformed", true, true),
             Self::Input { .. } | Self::Weights(_) => ("store-read", true, true),
             Self::Store(_) => ("store-write", true, false),
             Self::NoDepthMap => ("no-depth-map", false, true),
             Self::EmptyCloud(_) => ("empty-cloud", false, true),
+            Self::Panicked { .. } => ("panic", true, true),
             Self::GivenUp => ("given-up", true, false),
         };
         let lost_inputs = match self {
-            Self::Input { job, source } if source.is_lost() => vec![*job],
+            Self::Lost { jobs } => jobs.clone(),
             Self::Malformed { job, .. } => vec![*job],
             _ => Vec::new(),
         };
         let code = code.to_owned();
         Failure { code, message: with_causes(self), retryable, counts_against_job, lost_inputs }
+    }
+}
+
+impl JobError {
+    /// Whether the worker can do no further job: its device does not work.
+    pub fn is_fatal(&self) -> bool {
+        matches!(self, Self::Device(DeviceError::Load { .. } | DeviceError::Gone))
     }
 }
 
@@ -99,18 +120,14 @@ fn with_causes(error: &dyn std::error::Error) -> String {
 
 #[cfg(test)]
 mod tests {
-    use planesweep_plan::BlobKey;
-
     use super::*;
 
     #[test]
     fn a_lost_input_names_the_job_that_must_run_again_and_does_not_count() {
         let job = JobId([7; 32]);
-        let error = JobError::Input { job, source: StoreError::Damaged { key: BlobKey::of(b"x") } };
-        let failure = error.to_failure();
+        let failure = JobError::Lost { jobs: vec![job] }.to_failure();
         assert_eq!(failure.lost_inputs, [job]);
         assert!(failure.retryable && !failure.counts_against_job);
-        assert!(failure.message.contains("damaged"), "{}", failure.message);
     }
 
     #[test]

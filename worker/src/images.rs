@@ -10,6 +10,8 @@ use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 use thiserror::Error;
 
+use crate::cache::cache;
+
 /// Why a working image could not be made.
 #[derive(Debug, Error)]
 pub enum ImagesError {
@@ -73,14 +75,7 @@ pub(crate) struct Images {
 
 impl Images {
     pub fn new(budget_bytes: u64) -> Self {
-        let smallest_image_bytes = 1 << 18;
-        Self {
-            cache: Cache::with_weighter(
-                (budget_bytes / smallest_image_bytes).max(8) as usize,
-                budget_bytes,
-                ByPixels,
-            ),
-        }
+        Self { cache: cache(budget_bytes, ByPixels) }
     }
 
     /// The working image of a specification; several that ask for the same one wait for one of them.

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use planesweep_fusion::{FilteredMap, Funnel, VERTEX_BYTES, emit, encode, filter};
-use planesweep_plan::{BlobKey, FilterSpec, InferSpec, JobSpec};
+use planesweep_plan::{BlobKey, FilterSpec, InferSpec, JobId, JobSpec};
 use planesweep_proto::{Grant, Input, Success};
 use planesweep_scene::DepthMap;
 use quick_cache::Weighter;
@@ -19,6 +19,7 @@ use crate::blob::{
     decode_depth_map, decode_filtered_map, decode_points, encode_depth_map, encode_filtered_map,
     encode_points,
 };
+use crate::cache::cache;
 use crate::cloud::assemble;
 use crate::device::{Device, InferRequest};
 use crate::failure::JobError;
@@ -50,14 +51,12 @@ type Made = (Vec<u8>, BTreeMap<String, f64>);
 impl Jobs {
     /// `cache_bytes` is the budget of images in memory, and of depth maps, each.
     pub fn new(store: Store, device: Device, cache_bytes: u64) -> Self {
-        let smallest_map_bytes = 1 << 16;
-        let maps = (cache_bytes / smallest_map_bytes).max(16) as usize;
         Self {
             store,
             images: Images::new(cache_bytes),
             device,
             device_turn: Semaphore::new(1),
-            maps: Cache::with_weighter(maps, cache_bytes, ByPixels),
+            maps: cache(cache_bytes, ByPixels),
         }
     }
 
@@ -104,8 +103,10 @@ impl Jobs {
         for source in &spec.sources {
             sources.push(self.images.get(source).await?);
         }
-        let turn = self.device_turn.acquire().await;
-        check(cancelled)?;
+        let turn = tokio::select! {
+            turn = self.device_turn.acquire() => turn,
+            () = cancelled.cancelled() => return Err(JobError::GivenUp),
+        };
         started();
         let begun = Instant::now();
         let request = InferRequest {
@@ -130,12 +131,16 @@ impl Jobs {
     }
 
     async fn filter(&self, spec: &FilterSpec, inputs: &[Input]) -> Result<Made, JobError> {
-        let (own, others) = inputs.split_first().ok_or(JobError::NoDepthMap)?;
-        let reference = self.depth_map(own).await?.ok_or(JobError::NoDepthMap)?;
-        let mut neighbours = Vec::with_capacity(others.len());
-        for input in others {
-            neighbours.extend(self.depth_map(input).await?);
+        if inputs.is_empty() {
+            return Err(JobError::NoDepthMap);
         }
+        let mut maps = Vec::with_capacity(inputs.len());
+        for input in inputs {
+            maps.push(self.depth_map(input).await);
+        }
+        let mut neighbours = all_or_lost(maps)?;
+        let reference = neighbours.remove(0).ok_or(JobError::NoDepthMap)?;
+        let neighbours: Vec<Arc<DepthMap>> = neighbours.into_iter().flatten().collect();
         let options = spec.options;
         let filtered = compute(move || {
             let neighbours: Vec<&DepthMap> = neighbours.iter().map(AsRef::as_ref).collect();
@@ -168,10 +173,9 @@ impl Jobs {
     async fn assemble(&self, inputs: &[Input]) -> Result<Made, JobError> {
         let mut clouds = Vec::with_capacity(inputs.len());
         for input in inputs {
-            if let Some(bytes) = self.input(input).await? {
-                clouds.push((input.job, bytes));
-            }
+            clouds.push(self.input(input).await.map(|bytes| Some((input.job, bytes?))));
         }
+        let clouds: Vec<(JobId, Bytes)> = all_or_lost(clouds)?.into_iter().flatten().collect();
         compute(move || {
             let (bytes, points) = assemble(&clouds)?;
             Ok((bytes, BTreeMap::from([("points".to_owned(), points as f64)])))
@@ -182,8 +186,11 @@ impl Jobs {
     /// The result of a needed job; `None` when that job failed for good.
     async fn input(&self, input: &Input) -> Result<Option<Bytes>, JobError> {
         let Some(produced) = &input.produced else { return Ok(None) };
-        let read = self.store.get(&produced.blob).await;
-        read.map(Some).map_err(|source| JobError::Input { job: input.job, source })
+        match self.store.get(&produced.blob).await {
+            Ok(bytes) => Ok(Some(bytes)),
+            Err(source) if source.is_lost() => Err(JobError::Lost { jobs: vec![input.job] }),
+            Err(source) => Err(JobError::Input { job: input.job, source }),
+        }
     }
 
     async fn depth_map(&self, input: &Input) -> Result<Option<Arc<DepthMap>>, JobError> {
@@ -196,6 +203,20 @@ impl Jobs {
         };
         self.maps.get_or_insert_async(&produced.blob, read).await.map(Some)
     }
+}
+
+/// All values, or one error that names every lost result, so that all are made again at once.
+fn all_or_lost<T>(values: Vec<Result<T, JobError>>) -> Result<Vec<T>, JobError> {
+    let mut lost = Vec::new();
+    let mut all = Vec::with_capacity(values.len());
+    for value in values {
+        match value {
+            Ok(value) => all.push(value),
+            Err(JobError::Lost { jobs }) => lost.extend(jobs),
+            Err(error) => return Err(error),
+        }
+    }
+    if lost.is_empty() { Ok(all) } else { Err(JobError::Lost { jobs: lost }) }
 }
 
 fn check(cancelled: &CancellationToken) -> Result<(), JobError> {

@@ -15,6 +15,7 @@
 
 mod agent;
 mod blob;
+mod cache;
 mod cloud;
 mod device;
 mod failure;

@@ -5,19 +5,22 @@ use std::time::Instant;
 use anyhow::{Context, Result, bail};
 use planesweep_mvsnet::{DepthBackend, InferInput, TorchBackend, Weights};
 use planesweep_plan::{Plan, ViewPlan, plan, working_size};
-use planesweep_scene::{DepthMap, Raster, Scene, ViewId, WorkingImage, read_image, read_scene};
+use planesweep_scene::{DepthMap, Raster, Scene, ViewId, WorkingImage, read_image};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use crate::args::DepthArgs;
 use crate::console::Outcome;
+use crate::input;
 use crate::network::read_weights;
-use crate::out_folder::{MapFiles, OutFolder, depth_range};
+use crate::out_folder::{MapFiles, OutFolder};
 
 /// Infers and writes one depth map.
 pub fn run(args: &DepthArgs) -> Result<Outcome> {
-    let scene = read_scene(&args.scene, &args.read.options())
-        .with_context(|| format!("cannot read the scene {}", args.scene.display()))?;
+    let input::Input { scene, skipped, .. } = input::read(&args.scene, &args.read.options())?;
+    for view in &skipped {
+        eprintln!("skipped: {}: {}", view.view, view.reason);
+    }
     let plan = plan(&scene, &args.plan.options(None));
     let view = find(&scene, &plan, &args.view)?;
     let (_, weights) = read_weights(&args.network.weights)?;
@@ -27,15 +30,15 @@ pub fn run(args: &DepthArgs) -> Result<Outcome> {
     let images: Vec<WorkingImage> =
         ids.par_iter().map(|id| working_image(&scene, &plan, *id)).collect::<Result<_>>()?;
     let sources: Vec<&WorkingImage> = images[1..].iter().collect();
-    let input = InferInput { reference: &images[0], sources: &sources, hypotheses: &view.hypotheses };
+    let request = InferInput { reference: &images[0], sources: &sources, hypotheses: &view.hypotheses };
     let images_seconds = begun.elapsed().as_secs_f64();
-    let (map, probability) = infer(args, &weights, input)?;
+    let (map, probability) = infer(args, &weights, request)?;
     let seconds = begun.elapsed().as_secs_f64();
 
     let name = &scene.views[&view.view].name;
     let out = OutFolder::create(&args.out, [(view.view, name.as_str())])?;
     let everything = Raster::filled(map.width(), map.height(), true);
-    let files = out.write_map(view.view, &map, &everything, &depth_range(&view.hypotheses))?;
+    let files = out.write_map(view.view, &map, &everything, &view.hypotheses)?;
     let probed = write_probability(args, &out, view, probability.as_deref())?;
     let confident = map.confidence.values().iter().filter(|c| **c > 0.8).count();
     let share = confident as f64 / map.confidence.values().len() as f64;
@@ -63,7 +66,7 @@ pub fn run(args: &DepthArgs) -> Result<Outcome> {
         "preview": preview,
         "probability": probed,
     });
-    Ok(Outcome { text, value, skipped_views: false })
+    Ok(Outcome { text, value, skipped_views: !skipped.is_empty() })
 }
 
 /// The depth map, and the probability over depth at the probed pixel.

@@ -1,11 +1,11 @@
 //! From the results in the store to the files that people use.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
 use bytes::Bytes;
-use planesweep_fusion::{Point, read_ply};
+use planesweep_fusion::VERTEX_BYTES;
 use planesweep_plan::{BlobKey, NUMERICS_VERSION, ViewPlan};
 use planesweep_proto::{CODE_VERSION, JobResult, JobState};
 use planesweep_report::{
@@ -52,6 +52,7 @@ pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Out
     let scene = &run.prepared.input.scene;
     let planned = run.prepared.plan.views.iter().map(|v| (v.view, scene.views[&v.view].name.as_str()));
     let out = OutFolder::create(&run.args.out, planned)?;
+    out.clear()?;
     let mut views: Vec<&ViewPlan> = run.prepared.plan.views.iter().collect();
     views.sort_by_key(|view| view.view);
     let exported: Vec<Option<ExportedView>> =
@@ -59,20 +60,19 @@ pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Out
     let exported: Vec<ExportedView> = exported.into_iter().flatten().collect();
     write_mvsnet_side(&out, &exported)?;
     let skipped = skipped_views(run);
-    let (cloud_key, points) = write_cloud(run, &out)?;
+    let (cloud_key, cloud) = write_cloud(run, &out)?;
+    let points = vertices(&cloud).count() as u64;
 
     // Kinds of jobs overlap in time and run on several workers, so these are sums, not parts.
     for kind in ["infer", "filter", "emit", "assemble"] {
-        // What an inference waited for the device is not its own time.
-        let seconds = |r: &JobResult| r.measurements.get("network_seconds").copied().unwrap_or(r.seconds);
-        let seconds = run.results.iter().filter(|r| r.kind == kind).map(seconds).sum();
+        let seconds = run.results.iter().filter(|r| r.kind == kind).map(own_seconds).sum();
         stages.push((format!("{kind}, summed"), seconds));
     }
     stages.push(("write".to_owned(), writing.elapsed().as_secs_f64()));
-    let record = record(run, &exported, &skipped, cloud_key, points.len() as u64);
+    let record = record(run, &exported, &skipped, cloud_key, points);
     out.write_file(FILE_NAME, &serde_json::to_vec_pretty(&record).context("cannot write run.json")?)?;
-    let report = report(run, &exported, &skipped, &stages, points.len() as u64, begun);
-    write_report(&out, &report, exported, &points)?;
+    let report = report(run, &exported, &skipped, &stages, points, begun);
+    write_report(&out, &report, exported, &cloud)?;
 
     let mut text = String::new();
     for (name, seconds) in &stages {
@@ -84,18 +84,23 @@ pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Out
     }
     let root = out.root().display();
     text.push_str(&format!(
-        "{} points in {root}/cloud.ply; {root}/report.html shows the rest\n",
-        points.len()
+        "{points} points in {root}/cloud.ply; {root}/report.html shows the rest
+"
     ));
     let value = json!({
         "out": out.root(),
-        "points": points.len(),
+        "points": points,
         "cloud_blake3": cloud_key.to_string(),
         "skipped": skipped,
         "stages": stages,
         "report": report,
     });
     Ok(Outcome { text, value, skipped_views: !skipped.is_empty() })
+}
+
+/// How long a job computed; what an inference waited for the device is not its own time.
+fn own_seconds(result: &JobResult) -> f64 {
+    result.measurements.get("network_seconds").copied().unwrap_or(result.seconds)
 }
 
 fn result_of<'a>(run: &'a Finished<'_>, kind: &str, view: Option<ViewId>) -> Option<&'a JobResult> {
@@ -125,23 +130,23 @@ fn export_view(run: &Finished<'_>, out: &OutFolder, plan: &ViewPlan) -> Result<O
     }
     let emit = result_of(run, "emit", Some(plan.view));
     funnel.emitted = emit.and_then(|r| r.measurements.get("points")).map_or(0, |points| *points as u64);
-    let files = out.write_map(plan.view, &map, &kept, &depth_range(&plan.hypotheses))?;
+    let files = out.write_map(plan.view, &map, &kept, &plan.hypotheses)?;
     let names =
         |ids: &[ViewId]| ids.iter().map(|id| run.prepared.input.scene.views[id].name.clone()).collect();
     let report = ViewReport {
         id: plan.view,
         name: view.name.clone(),
-        width: map.width() as u32,
-        height: map.height() as u32,
+        width: plan.working_size.0,
+        height: plan.working_size.1,
         depth_min: plan.hypotheses.min(),
         depth_max: plan.hypotheses.max(),
         depth_count: plan.hypotheses.count(),
         sampling: plan.hypotheses.sampling(),
         sources: names(&plan.sources),
         funnel,
-        seconds: infer.seconds,
+        seconds: own_seconds(infer),
         preview: Some(files.preview_name),
-        warnings: Vec::new(),
+        warnings: [filter, emit].into_iter().flatten().filter_map(failure).collect(),
     };
     let record = RecordedView {
         id: plan.view,
@@ -159,15 +164,21 @@ fn export_view(run: &Finished<'_>, out: &OutFolder, plan: &ViewPlan) -> Result<O
     Ok(Some(ExportedView { record, report, preview: files.picture }))
 }
 
+fn failure(result: &JobResult) -> Option<String> {
+    let (_, message) = result.failure.as_ref().filter(|_| result.state == JobState::Failed)?;
+    Some(format!("{}: {message}", result.kind))
+}
+
 /// Cameras, pairs and trajectory, as users of MVSNet folders and of Tanks and Temples want them.
 fn write_mvsnet_side(out: &OutFolder, views: &[ExportedView]) -> Result<()> {
     let mut pairs = BTreeMap::new();
+    let exported: BTreeSet<ViewId> = views.iter().map(|view| view.record.id).collect();
     for ExportedView { record, .. } in views {
         let cam = mvsnet_cam_text(&record.depth_camera, Some(&depth_range(&record.hypotheses)));
         out.write_file(&format!("cams/{:08}_cam.txt", record.id.0), cam.as_bytes())?;
         // The scores are ranks: best first is all that readers of the file use.
         let count = record.neighbours.len();
-        let scored = record.neighbours.iter().enumerate();
+        let scored = record.neighbours.iter().filter(|view| exported.contains(view)).enumerate();
         let scored = scored.map(|(rank, view)| SourceScore { view: *view, score: (count - rank) as f64 });
         pairs.insert(record.id, scored.collect());
     }
@@ -177,7 +188,7 @@ fn write_mvsnet_side(out: &OutFolder, views: &[ExportedView]) -> Result<()> {
     Ok(())
 }
 
-fn write_cloud(run: &Finished<'_>, out: &OutFolder) -> Result<(BlobKey, Vec<Point>)> {
+fn write_cloud(run: &Finished<'_>, out: &OutFolder) -> Result<(BlobKey, Bytes)> {
     let assembled = result_of(run, "assemble", None).context("the ledger knows no cloud")?;
     let Some((key, _)) = assembled.blob else {
         let (_, message) = assembled.failure.clone().unwrap_or_default();
@@ -186,17 +197,35 @@ fn write_cloud(run: &Finished<'_>, out: &OutFolder) -> Result<(BlobKey, Vec<Poin
     let bytes = blob(run, assembled)?.context("the cloud is not in the store")?;
     let path = out.root().join("cloud.ply");
     write_atomically(&path, &bytes).with_context(|| format!("cannot write {}", path.display()))?;
-    Ok((key, read_ply(&path)?))
+    Ok((key, bytes))
 }
 
-/// All views without a depth map: left out before, or failed for good.
+/// Position and colour of every point of a cloud that a worker assembled.
+fn vertices(cloud: &[u8]) -> impl Iterator<Item = ([f32; 3], [u8; 3])> {
+    const END: &[u8] = b"end_header\n";
+    let header =
+        cloud.windows(END.len()).position(|window| window == END).map_or(cloud.len(), |at| at + END.len());
+    let (vertices, _) = cloud[header..].as_chunks::<VERTEX_BYTES>();
+    vertices.iter().map(|v| {
+        let float = |at: usize| f32::from_le_bytes([v[at], v[at + 1], v[at + 2], v[at + 3]]);
+        ([float(0), float(4), float(8)], [v[24], v[25], v[26]])
+    })
+}
+
+/// All views that are not in the cloud: left out before, or with a job that failed for good.
 fn skipped_views(run: &Finished<'_>) -> Vec<Skipped> {
     let mut skipped = all_skipped(&run.prepared.input, &run.prepared.plan);
-    for result in run.results.iter().filter(|r| r.kind == "infer" && r.state == JobState::Failed) {
-        let view = result.view.and_then(|id| run.prepared.input.scene.views.get(&id));
-        let (_, reason) = result.failure.clone().unwrap_or_default();
-        skipped.extend(view.map(|view| Skipped { view: view.name.clone(), reason }));
+    let mut failed = BTreeMap::new();
+    for result in run.results.iter().filter(|result| result.state == JobState::Failed) {
+        if let Some(view) = result.view.and_then(|id| run.prepared.input.scene.views.get(&id)) {
+            // What follows from a failure fails too; the first says why.
+            failed.entry(view.id).or_insert_with(|| {
+                let (_, message) = result.failure.clone().unwrap_or_default();
+                Skipped { view: view.name.clone(), reason: format!("{}: {message}", result.kind) }
+            });
+        }
     }
+    skipped.extend(failed.into_values());
     skipped
 }
 
@@ -268,20 +297,12 @@ fn report(
     }
 }
 
-fn write_report(
-    out: &OutFolder,
-    report: &RunReport,
-    views: Vec<ExportedView>,
-    points: &[Point],
-) -> Result<()> {
+fn write_report(out: &OutFolder, report: &RunReport, views: Vec<ExportedView>, cloud: &[u8]) -> Result<()> {
     out.write_file("report.json", report.to_json().context("cannot write report.json")?.as_bytes())?;
     let (width, height) = CLOUD_PICTURE;
     // As the middle view's photographer saw it.
     let camera: Option<Camera> = views.get(views.len() / 2).map(|view| view.record.depth_camera);
-    let cloud = camera.map(|camera| {
-        let points = points.iter().map(|p| (p.position.map(|v| v as f32), p.color));
-        render_cloud(points, &camera, width, height)
-    });
+    let cloud = camera.map(|camera| render_cloud(vertices(cloud), &camera, width, height));
     if let Some(cloud) = &cloud {
         out.write_file("cloud.png", &encode_png(cloud)?)?;
     }

@@ -12,7 +12,7 @@ use crate::input::{self, all_skipped};
 /// Says what would be done.
 pub fn run(args: &InspectArgs) -> Result<Outcome> {
     let input = input::read(&args.scene, &args.read.options())?;
-    let plan = plan(&input.scene, &args.plan.options(None));
+    let plan = plan(&input.scene, &args.plan.options(Some(&args.filter)));
     let skipped = all_skipped(&input, &plan);
     let scene = &input.scene;
     let mut text = format!(

@@ -1,10 +1,10 @@
 //! `planesweep reconstruct`: the whole way on one host.
 
-use std::fs;
-use std::path::Path;
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, anyhow, bail};
 use planesweep_coordinator::{Config, Coordinator, Handle};
 use planesweep_mvsnet::Weights;
 use planesweep_plan::{BlobKey, Job, JobId, Plan, RunId, jobs, plan};
@@ -16,7 +16,7 @@ use super::export::{self, Finished};
 use crate::args::ReconstructArgs;
 use crate::console::{Outcome, Progress};
 use crate::input::{self, Input};
-use crate::network::{backend_factory, default_workers, read_weights};
+use crate::network::{backend_factory, default_workers, read_weights, weights_for};
 use crate::supervisor::Supervisor;
 
 /// How often progress is asked for.
@@ -37,12 +37,15 @@ pub struct Prepared {
 }
 
 /// Reconstructs a scene.
-pub fn run(args: &ReconstructArgs, json: bool) -> Result<Outcome> {
+pub fn run(args: &ReconstructArgs, json: bool, verbose: u8) -> Result<Outcome> {
     let begun = Instant::now();
     let mut stages = Stages::new();
-    // The workers make their own; this only refuses a wrong name before any work.
-    drop(backend_factory(&args.network.device)?);
     let (weights_bytes, weights) = read_weights(&args.network.weights)?;
+    let weights_bytes = weights_for(&args.network.device, weights_bytes);
+    // The workers make their own; this one only says at once when the device is not there.
+    let factory = backend_factory(&args.network.device)?;
+    drop(factory(&weights_bytes, 1).map_err(|e| anyhow!("cannot use device {}: {e}", args.network.device))?);
+    check_out(args)?;
     let input = timed(&mut stages, "read images", || input::read(&args.scene, &args.read.options()))?;
     for warning in &input.scene.warnings {
         eprintln!("warning: {warning}");
@@ -64,15 +67,10 @@ pub fn run(args: &ReconstructArgs, json: bool) -> Result<Outcome> {
     }
     let prepared = Prepared { input, plan, weights, weights_key, jobs };
 
-    let state = args.out.join(".planesweep");
-    if args.fresh && state.exists() {
-        fs::remove_dir_all(&state).with_context(|| format!("cannot remove {}", state.display()))?;
-    }
-    fs::create_dir_all(&state).with_context(|| format!("cannot make the folder {}", state.display()))?;
-    let state = state.canonicalize().with_context(|| format!("cannot resolve {}", state.display()))?;
+    let (state, _lock) = open_state(&args.out, args.fresh)?;
     let runtime = tokio::runtime::Runtime::new().context("cannot start the runtime")?;
     let (store, results) =
-        runtime.block_on(compute(args, &state, weights_bytes, &prepared, workers, &mut stages))?;
+        runtime.block_on(compute(args, &state, weights_bytes, &prepared, (workers, verbose), &mut stages))?;
     let finished =
         Finished { args, prepared: &prepared, store: &store, results: &results, runtime: &runtime };
     export::run(&finished, stages, begun)
@@ -91,15 +89,15 @@ async fn compute(
     state: &Path,
     weights: Vec<u8>,
     prepared: &Prepared,
-    workers: u32,
+    (workers, verbose): (u32, u8),
     stages: &mut Stages,
 ) -> Result<(Store, Vec<JobResult>)> {
     let store = Store::open(&format!("file://{}", state.join("store").display()))?;
     store.put(weights.into()).await.context("cannot store the weights")?;
     let config = Config::new(state.join("ledger.sqlite"), store.url());
     let coordinator = Coordinator::start(config).await.context("cannot start the coordinator")?;
-    let (drain, kill) = (CancellationToken::new(), CancellationToken::new());
-    listen_for_ctrl_c(drain.clone(), kill.clone());
+    let interrupts = Interrupts::default();
+    interrupts.clone().listen();
     let begun = Instant::now();
     let mut missing: Vec<JobId> = Vec::new();
     let mut supervisor = None;
@@ -111,40 +109,90 @@ async fn compute(
         };
         let submitted =
             coordinator.submit(header, prepared.jobs.clone()).await.context("cannot submit the jobs")?;
-        if submitted.reused > 0 {
-            eprintln!("{} of {} jobs are done already", submitted.reused, submitted.jobs);
-        }
-        let is_finished = coordinator.status(&submitted.run, 0).await?.finished;
-        if supervisor.is_none() && !is_finished {
-            supervisor = Some(Supervisor::start(workers, &coordinator.url(), &args.network.device)?);
-        }
-        let interrupted = follow(&coordinator, &submitted.run, &drain, prepared).await?;
-        if interrupted {
-            if let Some(supervisor) = supervisor.take() {
-                supervisor.stop(&kill).await;
+        missing = lost_results(&coordinator, &submitted.run, &store).await?;
+        if missing.is_empty() && !coordinator.status(&submitted.run, 0).await?.finished {
+            if submitted.reused > 0 {
+                eprintln!("{} of {} jobs are done already", submitted.reused, submitted.jobs);
             }
-            coordinator.shutdown().await;
-            bail!("stopped; run the same command again to go on");
-        }
-        let results = coordinator.results(&submitted.run).await.context("cannot read the ledger")?;
-        for result in &results {
-            if let Some((key, length)) = &result.blob
-                && !store.has(key, *length).await?
-            {
-                missing.push(result.job);
+            if supervisor.is_none() {
+                let device = &args.network.device;
+                supervisor = Some(Supervisor::start(workers, &coordinator.url(), device, verbose)?);
             }
+            if follow(&coordinator, &submitted.run, &interrupts.drain, prepared).await? {
+                if let Some(supervisor) = supervisor.take() {
+                    supervisor.stop(&interrupts.kill).await;
+                }
+                coordinator.shutdown().await;
+                bail!("stopped; run the same command again to go on");
+            }
+            missing = lost_results(&coordinator, &submitted.run, &store).await?;
         }
         if missing.is_empty() {
+            let results = coordinator.results(&submitted.run).await.context("cannot read the ledger")?;
             stages.push(("compute".to_owned(), begun.elapsed().as_secs_f64()));
             if let Some(supervisor) = supervisor.take() {
-                supervisor.stop(&kill).await;
+                supervisor.finish(&interrupts.kill).await;
             }
             coordinator.shutdown().await;
+            interrupts.computed.cancel();
             return Ok((store, results));
         }
-        eprintln!("{} results are no longer in the store and are made again", missing.len());
+        eprintln!("{} results in the store are lost or damaged and are made again", missing.len());
     }
     bail!("results keep vanishing from the store at {}", store.url());
+}
+
+/// Done jobs whose results are not in the store, or not as they were written.
+async fn lost_results(coordinator: &Handle, run: &RunId, store: &Store) -> Result<Vec<JobId>> {
+    let mut lost = Vec::new();
+    for result in coordinator.results(run).await.context("cannot read the ledger")? {
+        let Some((key, _)) = &result.blob else { continue };
+        match store.get(key).await {
+            Ok(_) => {}
+            Err(error) if error.is_lost() => lost.push(result.job),
+            Err(error) => return Err(error).context("cannot read the store"),
+        }
+    }
+    Ok(lost)
+}
+
+/// Refuses an output folder that would be written over the scene or cannot be named on the wire.
+fn check_out(args: &ReconstructArgs) -> Result<()> {
+    fs::create_dir_all(&args.out)
+        .with_context(|| format!("cannot make the folder {}", args.out.display()))?;
+    let out = args.out.canonicalize().with_context(|| format!("cannot find {}", args.out.display()))?;
+    if args.scene.canonicalize().is_ok_and(|scene| scene == out) {
+        bail!("the result would be written over the scene; choose another folder for -o");
+    }
+    if out.to_str().is_none() {
+        bail!("the path of {} is not UTF-8; choose another folder for -o", out.display());
+    }
+    Ok(())
+}
+
+/// The folder of ledger and store, locked for this process.
+fn open_state(out: &Path, fresh: bool) -> Result<(PathBuf, File)> {
+    let state = out.join(".planesweep");
+    fs::create_dir_all(&state).with_context(|| format!("cannot make the folder {}", state.display()))?;
+    let state = state.canonicalize().with_context(|| format!("cannot find {}", state.display()))?;
+    let path = state.join("lock");
+    let lock = File::create(&path).with_context(|| format!("cannot make {}", path.display()))?;
+    if lock.try_lock().is_err() {
+        bail!("another planesweep works in {}", out.display());
+    }
+    if fresh {
+        for entry in fs::read_dir(&state).with_context(|| format!("cannot list {}", state.display()))? {
+            let entry = entry.with_context(|| format!("cannot list {}", state.display()))?.path();
+            let is_lock = entry == path;
+            let removed = match entry.is_dir() {
+                true => fs::remove_dir_all(&entry),
+                false if is_lock => Ok(()),
+                false => fs::remove_file(&entry),
+            };
+            removed.with_context(|| format!("cannot remove {}", entry.display()))?;
+        }
+    }
+    Ok((state, lock))
 }
 
 /// Shows progress until the run is finished (`false`) or the user wants to stop (`true`).
@@ -207,15 +255,31 @@ fn depth_maps_done(status: &RunStatus) -> String {
     format!("{} of {} depth maps", of(Some(JobState::Done)), of(None))
 }
 
-/// The first Ctrl-C drains, the second ends at once; both leave a run that can be resumed.
-fn listen_for_ctrl_c(drain: CancellationToken, kill: CancellationToken) {
-    tokio::spawn(async move {
-        for order in [drain, kill] {
-            if tokio::signal::ctrl_c().await.is_err() {
-                return;
+/// What Ctrl-C means at the moment.
+#[derive(Clone, Default)]
+struct Interrupts {
+    /// The first: running jobs are ended, the run can be resumed.
+    drain: CancellationToken,
+    /// The second: workers are ended at once; the run can still be resumed.
+    kill: CancellationToken,
+    /// All is computed: now it just ends the program, for files are complete or absent.
+    computed: CancellationToken,
+}
+
+impl Interrupts {
+    fn listen(self) {
+        tokio::spawn(async move {
+            while tokio::signal::ctrl_c().await.is_ok() {
+                if self.computed.is_cancelled() || self.kill.is_cancelled() {
+                    std::process::exit(1);
+                } else if self.drain.is_cancelled() {
+                    self.kill.cancel();
+                    eprintln!("stopping at once");
+                } else {
+                    self.drain.cancel();
+                    eprintln!("stopping when the running jobs are done; Ctrl-C again stops at once");
+                }
             }
-            order.cancel();
-            eprintln!("stopping when the running jobs are done; Ctrl-C again stops at once");
-        }
-    });
+        });
+    }
 }
