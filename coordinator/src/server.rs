@@ -6,8 +6,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use planesweep_plan::{Job, JobId, RunId};
+use planesweep_proto::limits::MAX_JOBS;
 use planesweep_proto::wire::coordinator_server::CoordinatorServer;
-use planesweep_proto::{JobResult, Order, RunStatus, ServiceError, SubmitHeader, Submitted};
+use planesweep_proto::{
+    JobResult, Order, RunStatus, ServiceError, SubmitHeader, Submitted, WireError, check_job,
+};
 use thiserror::Error;
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
@@ -116,8 +119,14 @@ impl Handle {
         format!("http://{}", self.local_addr)
     }
 
-    /// Submits a plan, as over the wire; each job follows those that it needs.
+    /// Submits a plan, as over the wire and with the same checks of each job; each job follows those
+    /// that it needs. The first job that is refused is named by its kind and view.
+    ///
+    /// A job that repeats an earlier one (the same id, and the same content but for paths, names and
+    /// ids of views) is left out: the run lists it once, under the view that came first. A job that
+    /// is known from an earlier run gets the paths and the view id of this one.
     pub async fn submit(&self, header: SubmitHeader, jobs: Vec<Job>) -> Result<Submitted, ServiceError> {
+        check_jobs(&jobs)?;
         self.driver().ask(|reply| Message::Submit(header, jobs, reply)).await?
     }
 
@@ -192,4 +201,19 @@ impl Handle {
     fn driver(&self) -> &DriverHandle {
         &self.service.driver
     }
+}
+
+/// What a submission over the wire is refused for while it is decoded.
+fn check_jobs(jobs: &[Job]) -> Result<(), ServiceError> {
+    if jobs.len() > MAX_JOBS {
+        return Err(WireError::TooMany { field: "jobs", got: jobs.len(), limit: MAX_JOBS }.into());
+    }
+    for job in jobs {
+        check_job(job).map_err(|error| {
+            let ServiceError { code, message } = error.into();
+            let of_view = job.spec.view().map(|view| format!(" of view {view}")).unwrap_or_default();
+            ServiceError::new(code, format!("{} job{of_view} is refused: {message}", job.spec.kind()))
+        })?;
+    }
+    Ok(())
 }

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use planesweep_coordinator::schedule::{
     Class, Command, Ending, Event, Finished, FreeSlots, Held, JobRecord, JobShape, LedgerState,
-    MAX_DEATHS_ALONE, MAX_FAILURES, Reopening, Snapshot, Timestamp, check_order, decide,
+    MAX_DEATHS_ALONE, MAX_FAILURES, MAX_LOSSES, Reopening, Snapshot, Timestamp, check_order, decide,
 };
 use planesweep_plan::{Attempt, JobId, WorkerId};
 use proptest::collection::vec;
@@ -78,7 +78,7 @@ impl Ledger {
                 if allowed {
                     job.outdated |= *why == Reopening::NewInput && job.state == LedgerState::Done;
                     job.state = LedgerState::Open;
-                    (job.failures, job.suspect, job.deaths_alone) = (0, false, 0);
+                    (job.failures, job.losses, job.suspect, job.deaths_alone) = (0, 0, false, 0);
                     self.published.remove(id);
                 }
                 allowed
@@ -95,7 +95,7 @@ impl Ledger {
                     let job = self.jobs.get_mut(id).expect("a known job");
                     job.state = LedgerState::Done;
                     job.outdated = false;
-                    (job.failures, job.suspect, job.deaths_alone) = (0, false, 0);
+                    (job.failures, job.losses, job.suspect, job.deaths_alone) = (0, 0, false, 0);
                 }
                 holds
             }
@@ -105,7 +105,7 @@ impl Ledger {
                     let job = self.jobs.get_mut(id).expect("a known job");
                     job.state = LedgerState::Failed;
                     job.outdated = true;
-                    (job.failures, job.suspect, job.deaths_alone) = (0, false, 0);
+                    (job.failures, job.losses, job.suspect, job.deaths_alone) = (0, 0, false, 0);
                 }
                 holds
             }
@@ -117,9 +117,10 @@ impl Ledger {
                     let job = self.jobs.get_mut(job).expect("a known job");
                     job.state = LedgerState::Open;
                     match command {
-                        Command::Retry { failures, .. } => {
+                        Command::Retry { failures, losses, .. } => {
                             assert!(*failures < MAX_FAILURES, "too many tries");
-                            job.failures = *failures;
+                            assert!(*losses < MAX_LOSSES, "too many losses");
+                            (job.failures, job.losses) = (*failures, *losses);
                         }
                         Command::Suspect { deaths_alone, .. } => {
                             assert!(*deaths_alone < MAX_DEATHS_ALONE, "too many deaths");

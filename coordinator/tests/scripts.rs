@@ -176,8 +176,9 @@ fn describe(command: &Command) -> Option<String> {
             format!("grant {}#{attempt} to {worker} until {deadline}", name(job))
         }
         Command::Complete { job, attempt, worker } => format!("complete {}#{attempt} by {worker}", name(job)),
-        Command::Retry { job, attempt, failures, until } => {
-            format!("retry {}#{attempt} not before {until}, failures {failures}", name(job))
+        Command::Retry { job, attempt, failures, losses, until } => {
+            let losses = if *losses > 0 { format!(", losses {losses}") } else { String::new() };
+            format!("retry {}#{attempt} not before {until}, failures {failures}{losses}", name(job))
         }
         Command::GiveUp { job, attempt, quarantined } => {
             let how = if *quarantined { "quarantine" } else { "give up" };

@@ -82,7 +82,8 @@ impl Client {
         Ok(self.stub.report(request).await?.into_inner().try_into()?)
     }
 
-    /// Submits a plan; each job follows those that it needs.
+    /// Submits a plan; each job follows those that it needs. A job that repeats an earlier one, but
+    /// for paths, names and ids of views, is left out.
     pub async fn submit(&mut self, header: &SubmitHeader, jobs: Vec<Job>) -> Result<Submitted, ServiceError> {
         let header = wire::SubmitChunk { header: Some(header.into()), jobs: Vec::new() };
         let chunks = std::iter::once(header).chain(Chunks { jobs: jobs.into_iter() });

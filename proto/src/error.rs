@@ -79,7 +79,13 @@ impl From<WireError> for ServiceError {
         } else {
             Code::Invalid
         };
-        Self::new(code, error.to_string())
+        let mut message = error.to_string();
+        let mut cause = std::error::Error::source(&error);
+        while let Some(inner) = cause {
+            message = format!("{message}: {inner}");
+            cause = inner.source();
+        }
+        Self::new(code, message)
     }
 }
 
@@ -123,6 +129,8 @@ impl From<Status> for ServiceError {
 
 #[cfg(test)]
 mod tests {
+    use planesweep_scene::{DepthHypotheses, Sampling};
+
     use super::*;
 
     #[test]
@@ -149,5 +157,12 @@ mod tests {
         assert_eq!((large.code, large.is_retryable()), (Code::TooLarge, false));
         let nonsense = ServiceError::from(WireError::Missing { field: "spec" });
         assert_eq!(nonsense.code, Code::Invalid);
+    }
+
+    #[test]
+    fn causes_are_told_too() {
+        let cause = DepthHypotheses::new(Sampling::Uniform, 5.0, 1.0, 4).expect_err("far before near");
+        let told = ServiceError::from(WireError::from(cause.clone())).message;
+        assert!(told.ends_with(&format!("refused: {cause}")), "{told}");
     }
 }

@@ -26,7 +26,7 @@ mod report;
 mod run;
 
 pub use client::{Client, TOKEN_HEADER, bearer};
-pub use convert::{WireError, decode_job, encode_job};
+pub use convert::{WireError, check_job, decode_job, encode_job};
 pub use error::{Code, ServiceError};
 pub use report::{
     Failure, FinishedJob, Grant, HeldJob, Input, JobAttempt, Order, Outcome, Produced, Report, ReportReply,

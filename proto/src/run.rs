@@ -25,7 +25,7 @@ pub struct SubmitHeader {
 pub struct Submitted {
     /// The run.
     pub run: RunId,
-    /// Its jobs.
+    /// Its jobs, each counted once.
     pub jobs: u32,
     /// Those of them that an earlier run had done already.
     pub reused: u32,

@@ -109,9 +109,9 @@ impl Driver {
                 let failure = payload.failure(job, *attempt);
                 tracing::warn!(%job, %attempt, quarantined, code = failure.code, message = failure.message, "job failed for good");
             }
-            Command::Retry { job, attempt, failures, .. } => {
+            Command::Retry { job, attempt, failures, losses, .. } => {
                 let failure = payload.failure(job, *attempt);
-                tracing::info!(%job, %attempt, failures, code = failure.code, message = failure.message, "job is tried again");
+                tracing::info!(%job, %attempt, failures, losses, code = failure.code, message = failure.message, "job is tried again");
             }
             Command::Dismiss { worker } => tracing::info!(%worker, "worker stopped reporting"),
             Command::CountLate { job, attempt } => {
@@ -145,8 +145,8 @@ async fn execute(step: &mut Step, command: &Command, payload: &Payload<'_>) -> R
         Command::Complete { job, attempt, worker } => {
             step.complete(job, *attempt, worker, payload.success(job, *attempt)).await
         }
-        Command::Retry { job, attempt, failures, .. } => {
-            step.retry(job, *attempt, *failures, &payload.failure(job, *attempt)).await
+        Command::Retry { job, attempt, failures, losses, .. } => {
+            step.retry(job, *attempt, (*failures, *losses), &payload.failure(job, *attempt)).await
         }
         Command::GiveUp { job, attempt, .. } => {
             step.give_up(job, *attempt, &payload.failure(job, *attempt)).await

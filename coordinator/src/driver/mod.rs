@@ -6,6 +6,7 @@
 
 mod carry_out;
 mod message;
+mod repeats;
 mod report;
 mod runs;
 

@@ -1,13 +1,13 @@
 //! Reports: recorded at once, answered at once or as soon as there is something to say.
 
-use planesweep_plan::WorkerId;
+use planesweep_plan::{Attempt, JobId, WorkerId};
 use planesweep_proto::{
-    Code, Grant, Input, JobAttempt, Order, Outcome, Report, ReportReply, ServiceError, WorkerState,
+    Code, Failure, Grant, Input, JobAttempt, Order, Outcome, Report, ReportReply, ServiceError, WorkerState,
 };
 
 use super::carry_out::Payload;
 use super::message::Reply;
-use super::{Driver, WorkerInfo};
+use super::{Driver, WorkerInfo, describe};
 use crate::ledger::{LedgerError, Step};
 use crate::schedule::{Command, Ending, Event, Finished, FreeSlots, Held, Timestamp, decide};
 
@@ -127,12 +127,42 @@ impl Driver {
         let mut grants = Vec::new();
         for command in self.carry_out(step, &commands, &Payload::default(), now).await? {
             let Command::Grant { job: id, attempt, .. } = command else { continue };
-            let job = step.job(&id).await?;
+            let job = match step.job(&id).await {
+                Ok(job) => job,
+                Err(error @ LedgerError::Damaged { .. }) => {
+                    self.give_up_unreadable(step, id, attempt, &error, now).await?;
+                    continue;
+                }
+                Err(error) => return Err(error),
+            };
             let input = |need| Input { job: need, produced: self.results.get(&need).cloned() };
             let inputs = job.needs.into_iter().map(input).collect();
             grants.push(Grant { job: id, attempt, spec: job.spec, inputs });
         }
         Ok(grants)
+    }
+
+    /// One row that does not decode must not roll back what else the step holds, for the same would
+    /// happen at each repetition.
+    async fn give_up_unreadable(
+        &mut self,
+        step: &mut Step,
+        job: JobId,
+        attempt: Attempt,
+        error: &LedgerError,
+        now: Timestamp,
+    ) -> Result<(), LedgerError> {
+        let failure = Outcome::Failure(Failure {
+            code: "unreadable".to_owned(),
+            message: describe(error),
+            retryable: false,
+            counts_against_job: true,
+            lost_inputs: Vec::new(),
+        });
+        let commands = decide(&self.snapshot, Event::Unreadable { job, attempt }, now);
+        let payload = Payload { outcomes: [((job, attempt), &failure)].into(), ..Payload::default() };
+        self.carry_out(step, &commands, &payload, now).await?;
+        Ok(())
     }
 
     /// Looks whether there is something to say now to those who wait.

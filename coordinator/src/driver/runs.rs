@@ -7,6 +7,7 @@ use planesweep_proto::{Code, ServiceError, SubmitHeader, Submitted};
 
 use super::Driver;
 use super::carry_out::Payload;
+use super::repeats::without_repeats;
 use crate::ledger::LedgerError;
 use crate::schedule::{Class, Event, JobShape, check_order, decide};
 
@@ -16,6 +17,7 @@ impl Driver {
         header: SubmitHeader,
         jobs: Vec<Job>,
     ) -> Result<Submitted, ServiceError> {
+        let jobs = without_repeats(jobs);
         let shapes: Vec<JobShape> = jobs.iter().map(shape).collect();
         check_order(&shapes).map_err(|e| ServiceError::new(Code::Invalid, e.to_string()))?;
         match self.try_submit(&header, &jobs, shapes).await {
@@ -38,6 +40,11 @@ impl Driver {
         let commands = decide(&self.snapshot, lost, now);
         self.carry_out(&mut step, &commands, &payload, now).await?;
 
+        // The scene may have moved, and its views been numbered anew, since a job was first submitted.
+        // A leased one too: whoever gets it next must find the images.
+        for job in jobs.iter().filter(|job| self.snapshot.knows(&job.id)) {
+            step.refresh(job).await?;
+        }
         let (run, number) = step.insert_run(&header.name).await?;
         let commands = decide(&self.snapshot, Event::Submitted { jobs: shapes }, now);
         self.carry_out(&mut step, &commands, &payload, now).await?;

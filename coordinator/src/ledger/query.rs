@@ -40,9 +40,10 @@ impl Ledger {
     pub(crate) async fn run(&self, run: &RunId, after: u64) -> Result<RunRow, LedgerError> {
         let failed = LedgerError::statement("read a run");
         let (number, name, cancelled) = self.find(run).await?;
+        // Over indices alone, in their order: the rows are large, and this is asked every second.
         let rows = sqlx::query(
-            "SELECT kind, state, COUNT(*) AS jobs FROM run_jobs JOIN jobs ON jobs.position = run_jobs.job
-             WHERE run = $1 GROUP BY kind, state",
+            "SELECT kind, state, COUNT(*) AS jobs FROM jobs CROSS JOIN run_jobs
+             WHERE run_jobs.job = jobs.position AND run = $1 GROUP BY state, kind",
         )
         .bind(number)
         .fetch_all(&self.pool)
@@ -118,7 +119,7 @@ impl Ledger {
 
 pub(super) async fn records(pool: &SqlitePool) -> Result<Vec<JobRecord>, LedgerError> {
     let rows = sqlx::query(
-        "SELECT id, kind, needs, state, worker, attempt, failures, suspect, deaths_alone, outdated
+        "SELECT id, kind, needs, state, worker, attempt, failures, losses, suspect, deaths_alone, outdated
          FROM jobs ORDER BY position",
     )
     .fetch_all(pool)
@@ -143,6 +144,7 @@ fn record(row: &SqliteRow) -> Result<JobRecord, LedgerError> {
         state,
         attempt: Attempt(get(row, "attempt")?),
         failures: get(row, "failures")?,
+        losses: get(row, "losses")?,
         suspect: get(row, "suspect")?,
         deaths_alone: get(row, "deaths_alone")?,
         outdated: get(row, "outdated")?,

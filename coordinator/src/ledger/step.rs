@@ -78,27 +78,37 @@ impl Step {
         )
         .bind(job.id.0.to_vec())
         .bind(job.spec.kind())
-        .bind(job.spec.view().map(|ViewId(id)| i64::from(id)))
+        .bind(view(job))
         .bind(encode_job(job))
         .bind(job.needs.iter().flat_map(|JobId(hash)| *hash).collect::<Vec<u8>>());
         self.changed("add a job", query).await
+    }
+
+    /// Gives a known job the paths, names and view ids of a new submission; the rest is in its id.
+    pub async fn refresh(&mut self, job: &Job) -> Result<(), LedgerError> {
+        let query = sqlx::query("UPDATE jobs SET spec = $2, view = $3 WHERE id = $1 AND spec <> $2")
+            .bind(job.id.0.to_vec())
+            .bind(encode_job(job))
+            .bind(view(job));
+        self.execute("refresh a job", query).await?;
+        Ok(())
     }
 
     /// Makes a job open again.
     pub async fn reopen(&mut self, job: &JobId, why: Reopening) -> Result<bool, LedgerError> {
         let query = match why {
             Reopening::Resubmitted => sqlx::query(
-                "UPDATE jobs SET state = 'open', worker = NULL, ended = 0, failures = 0, suspect = 0, deaths_alone = 0
+                "UPDATE jobs SET state = 'open', worker = NULL, ended = 0, failures = 0, losses = 0, suspect = 0, deaths_alone = 0
                  WHERE id = $1 AND state IN ('failed', 'cancelled')",
             ),
             Reopening::ResultLost => sqlx::query(
-                "UPDATE jobs SET state = 'open', worker = NULL, ended = 0, failures = 0, suspect = 0, deaths_alone = 0,
+                "UPDATE jobs SET state = 'open', worker = NULL, ended = 0, failures = 0, losses = 0, suspect = 0, deaths_alone = 0,
                                  blob = NULL, blob_length = NULL
                  WHERE id = $1 AND state = 'done'",
             ),
             Reopening::NewInput => sqlx::query(
                 "UPDATE jobs SET outdated = CASE state WHEN 'done' THEN 1 ELSE outdated END,
-                                 state = 'open', worker = NULL, ended = 0, failures = 0, suspect = 0, deaths_alone = 0,
+                                 state = 'open', worker = NULL, ended = 0, failures = 0, losses = 0, suspect = 0, deaths_alone = 0,
                                  blob = NULL, blob_length = NULL
                  WHERE id = $1 AND state IN ('done', 'leased')",
             ),
@@ -149,9 +159,9 @@ impl Step {
             .expect("a map of names and finite numbers is always JSON");
         let query = sqlx::query(
             "UPDATE jobs SET state = 'done', blob = $4, blob_length = $5, measurements = $6, seconds = $7,
-                             failures = 0, suspect = 0, deaths_alone = 0, outdated = 0,
+                             failures = 0, losses = 0, suspect = 0, deaths_alone = 0, outdated = 0,
                              failure_code = NULL, failure = NULL,
-                             ended = (SELECT COALESCE(MAX(ended), 0) + 1 FROM jobs)
+                             ended = $8
              WHERE id = $1 AND attempt = $2 AND worker = $3 AND state = 'leased'",
         );
         let query = query
@@ -161,7 +171,8 @@ impl Step {
             .bind(success.blob.0.to_vec())
             .bind(success.length as i64)
             .bind(measurements)
-            .bind(success.seconds);
+            .bind(success.seconds)
+            .bind(self.next_end().await?);
         self.changed("publish a result", query).await
     }
 
@@ -170,14 +181,15 @@ impl Step {
         &mut self,
         job: &JobId,
         attempt: Attempt,
-        failures: u32,
+        (failures, losses): (u32, u32),
         failure: &Failure,
     ) -> Result<bool, LedgerError> {
         let query = sqlx::query(
-            "UPDATE jobs SET state = 'open', worker = NULL, failures = $3, failure_code = $4, failure = $5
+            "UPDATE jobs SET state = 'open', worker = NULL, failures = $3, losses = $4, failure_code = $5, failure = $6
              WHERE id = $1 AND attempt = $2 AND state = 'leased'",
         );
-        let query = query.bind(job.0.to_vec()).bind(i64::from(attempt.0)).bind(i64::from(failures));
+        let query = query.bind(job.0.to_vec()).bind(i64::from(attempt.0));
+        let query = query.bind(i64::from(failures)).bind(i64::from(losses));
         self.changed("open a failed job again", query.bind(&failure.code).bind(&failure.message)).await
     }
 
@@ -189,13 +201,23 @@ impl Step {
         failure: &Failure,
     ) -> Result<bool, LedgerError> {
         let query = sqlx::query(
-            "UPDATE jobs SET state = 'failed', failures = 0, suspect = 0, deaths_alone = 0, outdated = 1,
+            "UPDATE jobs SET state = 'failed', failures = 0, losses = 0, suspect = 0, deaths_alone = 0, outdated = 1,
                              failure_code = $3, failure = $4,
-                             ended = (SELECT COALESCE(MAX(ended), 0) + 1 FROM jobs)
+                             ended = $5
              WHERE id = $1 AND attempt = $2 AND state = 'leased'",
         );
         let query = query.bind(job.0.to_vec()).bind(i64::from(attempt.0));
-        self.changed("let a job fail", query.bind(&failure.code).bind(&failure.message)).await
+        let query = query.bind(&failure.code).bind(&failure.message).bind(self.next_end().await?);
+        self.changed("let a job fail", query).await
+    }
+
+    /// The number of the next job that ends. Never given twice, not even when the job that had the
+    /// highest runs again: who has seen the end of that one must see the new one too.
+    async fn next_end(&mut self) -> Result<i64, LedgerError> {
+        sqlx::query_scalar("UPDATE ends SET latest = latest + 1 RETURNING latest")
+            .fetch_one(&mut *self.transaction)
+            .await
+            .map_err(LedgerError::statement("number the end of a job"))
     }
 
     /// Takes a lease back without blame.
@@ -270,4 +292,8 @@ impl Step {
             .map_err(LedgerError::statement("read a job"))?;
         decode_job(&spec).map_err(|e| LedgerError::Damaged { what: "spec", found: e.to_string() })
     }
+}
+
+fn view(job: &Job) -> Option<i64> {
+    job.spec.view().map(|ViewId(id)| i64::from(id))
 }

@@ -65,7 +65,7 @@ pub enum Ending {
         retryable: bool,
         /// Whether it uses up one of the job's tries.
         counts: bool,
-        /// Needed jobs whose result is gone.
+        /// Needed jobs whose result is gone; they run again.
         lost: Vec<JobId>,
     },
 }
@@ -122,6 +122,13 @@ pub enum Event {
     Cancelled {
         /// The jobs.
         jobs: Vec<JobId>,
+    },
+    /// What was just granted cannot be read from the ledger.
+    Unreadable {
+        /// The job.
+        job: JobId,
+        /// Which try.
+        attempt: Attempt,
     },
     /// The results of these jobs are gone from the store.
     ResultsLost {
@@ -207,6 +214,8 @@ pub enum Command {
         attempt: Attempt,
         /// Failures that count against the job, with this one.
         failures: u32,
+        /// Tries that found an input lost and do not count, with this one.
+        losses: u32,
         /// Not before.
         until: Timestamp,
     },

@@ -26,8 +26,9 @@
 //! - Each grant has a higher attempt than all before it; only the attempt that holds the lease can
 //!   complete or fail the job, so each effect happens once.
 //! - A job is granted only when each job it needs is done or failed for good.
-//! - A job fails for good by itself, after [`MAX_FAILURES`] failures that count, or after
-//!   [`MAX_DEATHS_ALONE`] deaths of workers that held nothing else; not by anything else.
+//! - A job fails for good by itself, after [`MAX_FAILURES`] failures that count, after
+//!   [`MAX_LOSSES`] tries that found an input lost, after [`MAX_DEATHS_ALONE`] deaths of workers that
+//!   held nothing else, or when the ledger cannot give it out; not by anything else.
 //! - While a worker that takes its class lives and reports, every job ends.
 
 mod assign;
@@ -44,6 +45,10 @@ pub use submit::{OrderError, check_order};
 /// Failures that count against a job before it fails for good.
 pub const MAX_FAILURES: u32 = 3;
 
+/// Tries of a job that found an input lost, and did not count, before it fails for good: a store that
+/// loses everything must end the job at last.
+pub const MAX_LOSSES: u32 = 20;
+
 /// Deaths of workers running a job alone before it is quarantined.
 pub const MAX_DEATHS_ALONE: u32 = 3;
 
@@ -55,6 +60,8 @@ pub fn decide(snapshot: &Snapshot, event: Event, now: Timestamp) -> Vec<Command>
             report::reported(snapshot, &worker, ready, &held, &finished, now)
         }
         Event::WantsWork { worker, free } => assign::wants_work(snapshot, &worker, free, now),
+        // No other try would read more; without it the jobs that need it go on.
+        Event::Unreadable { job, attempt } => vec![Command::GiveUp { job, attempt, quarantined: false }],
         Event::Tick => lease::tick(snapshot, now),
         Event::Cancelled { jobs } => submit::cancelled(snapshot, &jobs),
         Event::ResultsLost { jobs } => submit::results_lost(snapshot, &jobs),

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use planesweep_plan::{JobId, WorkerId};
 
 use super::state::{Job, State};
-use super::{Command, Ending, Finished, Held, MAX_FAILURES, Reopening, Snapshot, Timestamp};
+use super::{Command, Ending, Finished, Held, MAX_FAILURES, MAX_LOSSES, Reopening, Snapshot, Timestamp};
 
 /// The worker lives; what it finished is recorded, what it holds renewed, and a lease of which it
 /// does not speak is taken back: the reply that granted it was lost on the way.
@@ -81,15 +81,16 @@ fn settle(
         .filter(|need| need.state == State::Done && lost.contains(&need.id))
         .map(|need| need.id)
         .collect();
-    // Lost inputs always count, so that a store that loses everything ends the job at last.
-    let failures = job.failures + u32::from(counts || !lost.is_empty());
-    if (!retryable && lost.is_empty()) || failures >= MAX_FAILURES {
+    let failures = job.failures + u32::from(counts);
+    let losses = job.losses + u32::from(!counts && !lost.is_empty());
+    let is_last = failures >= MAX_FAILURES || losses >= MAX_LOSSES;
+    if is_last || (!retryable && lost.is_empty()) {
         commands.push(Command::GiveUp { job: id, attempt, quarantined: false });
         return;
     }
     // A worker that drains hands its jobs on; any other failure may have a cause that passes.
     let until = if ready { now.plus(snapshot.lease_ms / 4) } else { now };
-    commands.push(Command::Retry { job: id, attempt, failures, until });
+    commands.push(Command::Retry { job: id, attempt, failures, losses, until });
     commands.extend(lost.into_iter().map(|job| Command::Reopen { job, why: Reopening::ResultLost }));
 }
 
@@ -100,6 +101,56 @@ fn reopen_dependents(snapshot: &Snapshot, job: &Job, commands: &mut Vec<Command>
         let dependent = &snapshot.jobs[*dependent as usize];
         if matches!(dependent.state, State::Done | State::Leased { .. }) {
             commands.push(Command::Reopen { job: dependent.id, why: Reopening::NewInput });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use planesweep_plan::Attempt;
+
+    use super::*;
+    use crate::schedule::{Class, Event, FreeSlots, JobShape, decide};
+
+    #[test]
+    fn a_store_that_loses_everything_ends_the_job_at_last() {
+        let (map, filter) = (JobId([0; 32]), JobId([1; 32]));
+        let worker = WorkerId("w".to_owned());
+        let mut now = Timestamp(0);
+        let mut snapshot = Snapshot::new(7000, [], now);
+        let mut happen = |event: Event, now| {
+            let commands = decide(&snapshot, event, now);
+            for command in &commands {
+                assert!(snapshot.apply(command, now), "{command:?}");
+            }
+            commands
+        };
+        let shape = |id, needs| JobShape { id, class: Class::Fuse, needs };
+        happen(Event::Submitted { jobs: vec![shape(map, vec![]), shape(filter, vec![map])] }, now);
+        let mut finished = Vec::new();
+        for losses in 1.. {
+            for job in [map, filter] {
+                happen(Event::Reported { worker: worker.clone(), ready: true, held: vec![], finished }, now);
+                now = now.plus(2000);
+                happen(
+                    Event::WantsWork { worker: worker.clone(), free: FreeSlots { infer: 0, fuse: 1 } },
+                    now,
+                );
+                let ending = if job == map {
+                    Ending::Success
+                } else {
+                    Ending::Failure { retryable: true, counts: false, lost: vec![map] }
+                };
+                finished = vec![Finished { job, attempt: Attempt(losses), ending }];
+            }
+            let commands =
+                happen(Event::Reported { worker: worker.clone(), ready: true, held: vec![], finished }, now);
+            finished = Vec::new();
+            let given_up = commands.iter().any(|command| matches!(command, Command::GiveUp { .. }));
+            assert_eq!(given_up, losses == MAX_LOSSES, "after {losses} losses: {commands:?}");
+            if given_up {
+                return;
+            }
         }
     }
 }

@@ -36,6 +36,8 @@ pub struct JobRecord {
     pub attempt: Attempt,
     /// Failures that count against it.
     pub failures: u32,
+    /// Tries that found an input lost and do not count.
+    pub losses: u32,
     /// Whether a worker died while it was running.
     pub suspect: bool,
     /// Deaths of workers that ran nothing else.
@@ -54,6 +56,7 @@ pub(super) struct Job {
     pub state: State,
     pub attempt: Attempt,
     pub failures: u32,
+    pub losses: u32,
     pub suspect: bool,
     pub deaths_alone: u32,
     pub outdated: bool,
@@ -223,8 +226,10 @@ impl Snapshot {
             Command::Grant { job, attempt, worker, .. } => self.grant(job, *attempt, worker),
             Command::Complete { job, attempt, worker } => self.end(job, *attempt, Some(worker), State::Done),
             Command::GiveUp { job, attempt, .. } => self.end(job, *attempt, None, State::Failed),
-            Command::Retry { job, attempt, failures, until } => {
-                self.take_back(job, *attempt, *until, |job| job.failures = *failures)
+            Command::Retry { job, attempt, failures, losses, until } => {
+                self.take_back(job, *attempt, *until, |job| {
+                    (job.failures, job.losses) = (*failures, *losses);
+                })
             }
             Command::Release { job, attempt } => self.take_back(job, *attempt, now, |_| ()),
             Command::Suspect { job, attempt, deaths_alone } => self.take_back(job, *attempt, now, |job| {
@@ -238,7 +243,7 @@ impl Snapshot {
     }
 
     fn add(&mut self, record: JobRecord, now: Timestamp) -> bool {
-        let JobRecord { shape, state, attempt, failures, suspect, deaths_alone, outdated } = record;
+        let JobRecord { shape, state, attempt, failures, losses, suspect, deaths_alone, outdated } = record;
         let needs: Option<Box<[Ordinal]>> =
             shape.needs.iter().map(|need| self.ordinals.get(need).copied()).collect();
         let Some(needs) = needs else { return false };
@@ -268,6 +273,7 @@ impl Snapshot {
             state,
             attempt,
             failures,
+            losses,
             suspect,
             deaths_alone,
             outdated,
@@ -299,7 +305,7 @@ impl Snapshot {
             // What failed may leave others without it; what is done is waited for by all others.
             job.outdated = state == State::Failed;
             job.state = state;
-            (job.failures, job.suspect, job.deaths_alone) = (0, false, 0);
+            (job.failures, job.losses, job.suspect, job.deaths_alone) = (0, 0, false, 0);
         }) && {
             let ordinal = self.ordinals[job];
             self.drop_from_holder(ordinal);
@@ -357,7 +363,7 @@ impl Snapshot {
         if !allowed {
             return false;
         }
-        (job.failures, job.suspect, job.deaths_alone) = (0, false, 0);
+        (job.failures, job.losses, job.suspect, job.deaths_alone) = (0, 0, false, 0);
         // A lost result comes back as it was; with a new input it may differ.
         job.outdated |= why == Reopening::NewInput && had_ended;
         self.drop_from_holder(ordinal);
@@ -435,6 +441,7 @@ impl JobRecord {
             state: LedgerState::Open,
             attempt: Attempt(0),
             failures: 0,
+            losses: 0,
             suspect: false,
             deaths_alone: 0,
             outdated: false,

@@ -11,8 +11,8 @@ use super::{Command, JobShape, Reopening, Snapshot};
 /// Why a list of jobs is no plan.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum OrderError {
-    /// A job is there twice.
-    #[error("job {job} is listed twice")]
+    /// Two different jobs have one id.
+    #[error("job {job} is listed twice, with different contents")]
     Twice {
         /// The job.
         job: JobId,

@@ -31,6 +31,11 @@ pub fn decode_job(bytes: &[u8]) -> Result<Job, WireError> {
     Job::try_from(job)
 }
 
+/// Whether the job would pass if it came over the wire; for jobs that do not.
+pub fn check_job(job: &Job) -> Result<(), WireError> {
+    Job::try_from(wire::Job::from(job)).map(drop)
+}
+
 impl From<&Job> for wire::Job {
     fn from(job: &Job) -> Self {
         Self {
