@@ -74,8 +74,6 @@ pub struct CpuBackend {
     memory_bytes: Option<u64>,
     /// Rows of the volume taken at a time, at most.
     step_rows: usize,
-    /// Rows of a volume of this width and number of depths, for the next inference.
-    pool: (usize, usize, Arc<Pool>),
     cache: FeatureCache,
     times: InferTimes,
 }
@@ -115,7 +113,6 @@ impl CpuBackend {
             memory_bytes,
             step_rows: STEP_ROWS,
             cache: FeatureCache::new(memory_bytes.map_or(CACHE_BYTES, |bytes| (bytes / 4) as usize)),
-            pool: (0, 0, Arc::default()),
             times: InferTimes::default(),
         })
     }
@@ -181,9 +178,7 @@ impl CpuBackend {
             None => rows.clone(),
         };
         let depths = cost.inverse_depths.len();
-        if (self.pool.0, self.pool.1) != (reference.width(), depths) {
-            self.pool = (reference.width(), depths, Arc::default());
-        }
+        let pool = Arc::default();
         let size = InferSize {
             width: 4 * reference.width(),
             height: 4 * reference.height(),
@@ -191,7 +186,8 @@ impl CpuBackend {
             views: input.sources.len() + 1,
         };
         let step_rows = self.step_rows(size);
-        let (pixels, times) = self.threads.install(|| self.sweep(&cost, &unrefined, window, step_rows));
+        let (pixels, times) =
+            self.threads.install(|| self.sweep(&pool, &cost, &unrefined, window, step_rows));
         self.times.cost = times.cost;
         self.times.regularization = times.regularization;
         self.times.regression = times.regression;
@@ -221,6 +217,7 @@ impl CpuBackend {
     /// The pixels of some rows of the unrefined depth map.
     fn sweep(
         &self,
+        pool: &Arc<Pool>,
         cost: &CostInput<'_>,
         rows: &Range<usize>,
         window: u32,
@@ -229,7 +226,7 @@ impl CpuBackend {
         let (width, height) = (cost.reference.width(), cost.reference.height());
         let needed = rows_for_depth(rows, height);
         let size = (width, needed.len(), cost.inverse_depths.len());
-        let mut volume = Regularization::new(&self.pool.2, &self.regularization, self.level, size, window);
+        let mut volume = Regularization::new(pool, &self.regularization, self.level, size, window);
         let mut pixels = Vec::with_capacity(needed.len() * width);
         let mut taken = 0;
         while taken < needed.len() {
@@ -304,7 +301,6 @@ mod tests {
 
     use super::*;
     use crate::backend::conformance::{self, Images};
-    use crate::bands::volume_bytes;
     use crate::{Refinement, WeightsMetadata};
 
     fn backend(metadata: WeightsMetadata, threads: usize) -> CpuBackend {
@@ -377,19 +373,6 @@ mod tests {
             images.hypotheses =
                 DepthHypotheses::new(Sampling::Inverse, 2.0, 8.0, count).expect("a valid range");
             assert!(images.infer(&mut backend).is_ok(), "{count} hypotheses");
-        }
-    }
-
-    #[test]
-    fn predicted_rows_are_those_that_are_held() {
-        for step_rows in [1, 2, 3, 5, 8, 11] {
-            let images = Images::new(64, 420, Sampling::Uniform);
-            let mut backend = backend(WeightsMetadata::untrained(Refinement::None), 2);
-            backend.step_rows = step_rows;
-            images.infer(&mut backend).expect("a depth map");
-            let (held, predicted) = (backend.pool.2.bytes(), volume_bytes(16, 112, 16, step_rows));
-            assert!(held <= predicted, "{step_rows} rows: {held} bytes, predicted were {predicted}");
-            assert!(predicted as f64 <= 1.1 * held as f64, "{step_rows} rows: {held} of {predicted}");
         }
     }
 

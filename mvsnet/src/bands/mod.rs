@@ -15,7 +15,5 @@ pub(crate) use halo::{rows_for_depth, rows_for_refinement};
 pub(crate) use images::{features, refined};
 pub(crate) use layers::{FeatureLayers, RegularizationLayers, refinement_layers};
 pub(crate) use predict::predict;
-#[cfg(test)]
-pub(crate) use predict::volume_bytes;
 pub use predict::{InferCost, InferSize};
 pub(crate) use volume::{Regularization, VolumeTimes};

@@ -61,7 +61,7 @@ pub(crate) fn predict(size: InferSize, threads: usize, step_rows: usize) -> Infe
 ///
 /// Follows how many rows each stage has taken and given: a row is held from when it begins to when the
 /// transposed layer has added it to its output.
-pub(crate) fn volume_bytes(width: usize, height: usize, depths: usize, step_rows: usize) -> usize {
+fn volume_bytes(width: usize, height: usize, depths: usize, step_rows: usize) -> usize {
     let plain = |taken: usize, height: usize| if taken == height { taken } else { taken.saturating_sub(1) };
     let up = |taken: usize, height: usize| {
         if taken == height { 2 * taken } else { (2 * taken).saturating_sub(1) }
@@ -97,4 +97,47 @@ pub(crate) fn volume_bytes(width: usize, height: usize, depths: usize, step_rows
         length: (0..scale).fold(depths, |depths, _| depths.div_ceil(2)),
     };
     (0..4).map(|scale| most[scale] * shape(scale).bytes()).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::bands::{FeatureLayers, Regularization, RegularizationLayers, features};
+    use crate::input::InputImage;
+    use crate::kernels::cost::{CostInput, PixelSweep};
+    use crate::kernels::simd::Level;
+    use crate::kernels::slab::Pool;
+    use crate::{CostMetric, Refinement, Weights, WeightsMetadata};
+
+    #[test]
+    fn predicted_slabs_are_those_that_are_taken() {
+        let weights = Weights::seeded(WeightsMetadata::untrained(Refinement::None), 1);
+        let level = Level::detect();
+        let image = InputImage { width: 64, height: 448, planes: vec![0.5; 3 * 64 * 448] };
+        let pool = Arc::<Pool>::default();
+        let map = features(&pool, &FeatureLayers::new(&weights, level), &image);
+        assert_eq!(pool.bytes(), images::features_bytes(64, 448));
+
+        let layers = RegularizationLayers::new(&weights, level);
+        let camera = nalgebra::Matrix3x4::identity();
+        let sweep = PixelSweep::new(&camera, &camera).expect("an invertible camera");
+        let cost = CostInput {
+            reference: &map,
+            sources: vec![(&map, sweep)],
+            inverse_depths: (1..=21).map(|depth| 1.0 / f64::from(depth)).collect(),
+            metric: CostMetric::Variance,
+        };
+        for step_rows in [1, 2, 3, 5, 8, 11] {
+            let pool = Arc::<Pool>::default();
+            let mut volume = Regularization::new(&pool, &layers, level, (16, 112, 21), 4);
+            let steps = (0..112).step_by(step_rows);
+            let rows: usize = steps.map(|y| volume.push(&cost, 0, step_rows.min(112 - y)).len() / 16).sum();
+            assert_eq!(rows, 112);
+            let (taken, predicted) = (pool.bytes(), volume_bytes(16, 112, 21, step_rows));
+            assert!(taken <= predicted, "{step_rows} rows: {taken} bytes, predicted were {predicted}");
+            assert!(predicted as f64 <= 1.1 * taken as f64, "{step_rows} rows: {taken} of {predicted}");
+        }
+    }
 }

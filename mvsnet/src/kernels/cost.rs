@@ -7,8 +7,11 @@
 
 use nalgebra::{Matrix3, Matrix3x4, Vector3};
 
+use rayon::prelude::*;
+
+use super::aligned::Aligned;
 use super::simd::{LANES, Level, Simd, by_level};
-use super::slab::{Aligned, COLUMN_START, Shape, Slab};
+use super::slab::{COLUMN_START, Shape, Slab};
 use crate::CostMetric;
 
 /// Channels of the features.
@@ -32,16 +35,15 @@ impl FeatureMap {
         let Shape { columns: height, channels, length: width } = slab.shape();
         assert_eq!(channels, CHANNELS);
         let mut data = Aligned::zeroed((height + 2) * (width + 2) * CHANNELS);
-        for (y, row) in
-            data.values_mut().chunks_exact_mut((width + 2) * CHANNELS).skip(1).take(height).enumerate()
-        {
+        let rows = data.values_mut().par_chunks_exact_mut((width + 2) * CHANNELS).skip(1).take(height);
+        rows.enumerate().for_each(|(y, row)| {
             for channel in 0..CHANNELS {
                 let pixels = row.chunks_exact_mut(CHANNELS).skip(1);
                 for (pixel, value) in pixels.zip(slab.channel(y, channel)) {
                     pixel[channel] = *value;
                 }
             }
-        }
+        });
         Self { width, height, data }
     }
 
@@ -93,14 +95,10 @@ pub(crate) struct CostInput<'a> {
     pub(crate) metric: CostMetric,
 }
 
-/// Where each depth of one pixel lies in one source.
-#[derive(Debug, Default)]
-struct Samples {
-    /// The pixel above and left of it, in the bordered map.
-    pixel: Vec<u32>,
-    /// Bilinear weights of that pixel and of those right, below, and right below; zero when outside.
-    weights: [Vec<f32>; 4],
-}
+/// Where each depth of one pixel lies in one source: the pixel above and left of it in the bordered map (the bits of
+/// a `u32`), then the bilinear weights of that pixel and of those right, below, and right below, which are zero
+/// outside; five parts, each of the padded number of depths.
+type Samples = Vec<f32>;
 
 /// Memory for the samples of one pixel.
 #[derive(Debug, Default)]
@@ -123,10 +121,7 @@ impl CostInput<'_> {
         assert!(x < self.reference.width && y < self.reference.height && output.len() == shape.column());
         scratch.0.resize_with(self.sources.len(), Samples::default);
         for samples in &mut scratch.0 {
-            samples.pixel.resize(shape.padded(), 0);
-            for weights in &mut samples.weights {
-                weights.resize(shape.padded(), 0.0);
-            }
+            samples.resize(5 * shape.padded(), 0.0);
         }
         run(level, &mut Task { input: self, x, y, shape, output, samples: &mut scratch.0 });
     }
@@ -156,18 +151,18 @@ unsafe fn column<S: Simd>(task: &mut Task<'_>) {
     let own = reference.data.values().as_ptr().add(pixel * CHANNELS);
     let own = [S::load(own), S::load(own.add(LANES))];
     let share = S::splat(1.0 / (sources.len() + 1) as f32);
-    for begin in (0..task.shape.padded()).step_by(LANES) {
+    let padded = task.shape.padded();
+    for begin in (0..padded).step_by(LANES) {
         let mut costs = [[S::splat(0.0); LANES]; 2];
         for lane in 0..LANES {
             // Differences to the reference's features have the same variance, and smaller sums round less.
             let mut sum = [S::splat(0.0); 2];
             let mut squares = sum;
             for ((map, _), samples) in sources.iter().zip(task.samples.iter()) {
-                let at = begin + lane;
-                let corner =
-                    map.data.values().as_ptr().add(*samples.pixel.get_unchecked(at) as usize * CHANNELS);
+                let sample = samples.as_ptr().add(begin + lane);
+                let corner = map.data.values().as_ptr().add((*sample).to_bits() as usize * CHANNELS);
                 let below = corner.add(map.pitch() * CHANNELS);
-                let w = [0, 1, 2, 3].map(|i: usize| S::splat(*samples.weights[i].get_unchecked(at)));
+                let w = [1, 2, 3, 4].map(|part: usize| S::splat(*sample.add(part * padded)));
                 for half in 0..2 {
                     let offset = half * LANES;
                     let mut v = S::mul(w[0], S::load(corner.add(offset)));
@@ -212,13 +207,15 @@ unsafe fn locate(
     ray: Vector3<f64>,
     offset: Vector3<f64>,
     inverse_depths: &[f64],
-    samples: &mut Samples,
+    samples: &mut [f32],
 ) {
     let (width, height, pitch) = (map.width as f64, map.height as f64, map.pitch() as f64);
-    let [w0, w1, w2, w3] = &mut samples.weights;
     let count = inverse_depths.len();
-    let (w0, w1, w2, w3) = (&mut w0[..count], &mut w1[..count], &mut w2[..count], &mut w3[..count]);
-    let pixel = &mut samples.pixel[..count];
+    let (pixel, weights) = samples.split_at_mut(samples.len() / 5);
+    let mut weights = weights.chunks_exact_mut(pixel.len());
+    let pixel = &mut pixel[..count];
+    let mut part = || &mut weights.next().expect("there are four")[..count];
+    let (w0, w1, w2, w3) = (part(), part(), part(), part());
     #[allow(clippy::needless_bitwise_bool, reason = "branches would keep the loop from being vectorised")]
     for i in 0..count {
         let s = inverse_depths[i];
@@ -232,7 +229,8 @@ unsafe fn locate(
         let (left, top) = (u.floor(), v.floor());
         let (right, bottom) = ((u - left) as f32, (v - top) as f32);
         let weight = if inside { 1.0 } else { 0.0 };
-        pixel[i] = ((top + 1.0) * pitch + (left + 1.0)).to_int_unchecked::<i32>() as u32;
+        let place = ((top + 1.0) * pitch + (left + 1.0)).to_int_unchecked::<i32>();
+        pixel[i] = f32::from_bits(place as u32);
         w0[i] = weight * (1.0 - right) * (1.0 - bottom);
         w1[i] = weight * right * (1.0 - bottom);
         w2[i] = weight * (1.0 - right) * bottom;

@@ -10,6 +10,7 @@
 )]
 #![allow(clippy::needless_range_loop, reason = "indices name registers, and loops over them must unroll")]
 
+mod aligned;
 pub(crate) mod cost;
 pub(crate) mod regress;
 pub(crate) mod simd;

@@ -3,8 +3,9 @@
 #![expect(unsafe_code, reason = "inner loops over pointers, with the sizes checked before")]
 #![allow(unsafe_op_in_unsafe_fn, reason = "the contract of each kernel covers its body as a whole")]
 
+use super::aligned::Aligned;
 use super::simd::{LANES, Level, Simd, by_level};
-use super::slab::{Aligned, Column};
+use super::slab::Column;
 
 /// Channels of the last layer's input.
 const CHANNELS: usize = 8;

@@ -3,12 +3,11 @@
 //! A row of a volume is a slab of columns `[x][channel][depth]`; a whole image is one with columns
 //! `[y][channel][x]`. Kernels vectorise along the last axis. Around the values lie zeros, which nobody
 //! ever overwrites, so that convolutions need no case for the border.
-#![expect(unsafe_code, reason = "aligned memory is seen as values")]
-
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use super::aligned::Aligned;
 use super::simd::LANES;
 
 /// Zeros before each channel, which are also those after the channel before it.
@@ -51,30 +50,6 @@ impl Shape {
 
     fn floats(self) -> usize {
         ((FRONT + self.columns + BACK) * self.column() + PAD + SLACK).next_multiple_of(LANES)
-    }
-}
-
-/// Values aligned to cache lines, at first zero.
-#[derive(Debug)]
-pub(crate) struct Aligned(Vec<Line>);
-
-#[derive(Clone, Copy, Debug)]
-#[repr(C, align(64))]
-struct Line([f32; LANES]);
-
-impl Aligned {
-    pub(crate) fn zeroed(len: usize) -> Self {
-        Self(vec![Line([0.0; LANES]); len.div_ceil(LANES)])
-    }
-
-    pub(crate) fn values(&self) -> &[f32] {
-        // SAFETY: a line is sixteen f32 without padding, and the vector is one allocation of lines.
-        unsafe { std::slice::from_raw_parts(self.0.as_ptr().cast(), self.0.len() * LANES) }
-    }
-
-    pub(crate) fn values_mut(&mut self) -> &mut [f32] {
-        // SAFETY: as above, and borrowed mutably.
-        unsafe { std::slice::from_raw_parts_mut(self.0.as_mut_ptr().cast(), self.0.len() * LANES) }
     }
 }
 
@@ -135,7 +110,7 @@ impl Slab {
 impl Drop for Slab {
     fn drop(&mut self) {
         if let Some(pool) = self.pool.take() {
-            let data = std::mem::replace(&mut self.data, Aligned(Vec::new()));
+            let data = std::mem::replace(&mut self.data, Aligned::zeroed(0));
             pool.free().entry(self.shape).or_default().push(data);
         }
     }

@@ -5,8 +5,9 @@
 #![expect(unsafe_code, reason = "inner loops over pointers, with the sizes checked before")]
 #![allow(unsafe_op_in_unsafe_fn, reason = "the contract of each kernel covers its body as a whole")]
 
+use super::aligned::Aligned;
 use super::simd::{LANES, Level, Simd, by_level};
-use super::slab::{Aligned, COLUMN_START, Column, Shape};
+use super::slab::{COLUMN_START, Column, Shape};
 
 /// A layer's weights in the order they are used.
 #[derive(Debug)]
@@ -76,7 +77,7 @@ struct Task<'a> {
     output: *mut f32,
 }
 
-by_level!(run(task: &Task<'_>) = column[4, 3][2, 1]);
+by_level!(run(task: &Task<'_>) = column[4, 2][2, 1]);
 
 /// # Safety
 /// As [`Simd`]; the sizes are those `apply` checks. The padded output is at most twice the padded input.

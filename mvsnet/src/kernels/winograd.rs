@@ -7,8 +7,9 @@
 #![expect(unsafe_code, reason = "inner loops over pointers, with the sizes checked before")]
 #![allow(unsafe_op_in_unsafe_fn, reason = "the contract of each kernel covers its body as a whole")]
 
+use super::aligned::Aligned;
 use super::simd::{LANES, Level, Simd, by_level};
-use super::slab::{Aligned, COLUMN_START, Column, Shape};
+use super::slab::{COLUMN_START, Column, Shape};
 
 /// Products for a 2x2 block of outputs.
 const PRODUCTS: usize = 16;
