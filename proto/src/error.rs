@@ -162,7 +162,8 @@ mod tests {
     #[test]
     fn causes_are_told_too() {
         let cause = DepthHypotheses::new(Sampling::Uniform, 5.0, 1.0, 4).expect_err("far before near");
-        let told = ServiceError::from(WireError::from(cause.clone())).message;
-        assert!(told.ends_with(&format!("refused: {cause}")), "{told}");
+        let text = format!("refused: {cause}");
+        let told = ServiceError::from(WireError::from(cause)).message;
+        assert!(told.ends_with(&text), "{told}");
     }
 }
