@@ -12,8 +12,14 @@ if [ -n "${LIBTORCH:-}" ]; then
     exit 0
 fi
 
+cache="${XDG_CACHE_HOME:-$HOME/.cache}/planesweep/libtorch-2.13.0-cpu"
+if command -v python3 >/dev/null && python3 "$here/scripts/fetch_libtorch.py" --check "$cache"; then
+    ln -sfn "$cache" "$here/.libtorch"
+    exit 0
+fi
+
 missing=""
-command -v python3 >/dev/null || missing="$missing python3"
+command -v python3 >/dev/null || missing="$missing python3 python3-pip"
 command -v c++ >/dev/null || missing="$missing g++"
 if command -v python3 >/dev/null && ! python3 -m pip --version >/dev/null 2>&1; then
     missing="$missing python3-pip"
@@ -27,6 +33,5 @@ if [ "$(uname -sm)" != "Linux x86_64" ]; then
     exit 1
 fi
 
-cache="${XDG_CACHE_HOME:-$HOME/.cache}/planesweep/libtorch-2.13.0-cpu"
 python3 "$here/scripts/fetch_libtorch.py" "$cache"
 ln -sfn "$cache" "$here/.libtorch"

@@ -1,11 +1,13 @@
 """Fetches the wheels that hold libtorch 2.13.0 and unpacks the libraries and headers of its CPU part.
 
-Called by fetch-libtorch.sh with the folder to fill. Only the standard library is used; pip is asked
-where the wheels lie, the download itself is resumable.
+Called by fetch-libtorch.sh with the folder to fill; with --check before it, says by its exit status
+whether that folder is complete. Only the standard library is used; pip is asked where the wheels lie,
+the download itself is resumable.
 """
 
 import fcntl
 import hashlib
+import http.client
 import json
 import pathlib
 import shutil
@@ -41,6 +43,7 @@ WHEELS = [
 ]
 PLATFORMS = ["manylinux_2_28_x86_64", "manylinux_2_25_x86_64", "manylinux_2_17_x86_64"]
 CHUNK_BYTES = 1 << 20
+TIMEOUT_S = 60
 
 
 def locate(requirement):
@@ -65,10 +68,13 @@ def sha256(path):
 
 
 def download(url, path):
-    """Appends what is still missing of `url` to `path`."""
+    """Appends what is still missing of `url` to `path`. When this returns, `path` has the full length.
+
+    Raises OSError when the connection or the disk fails; what has arrived stays, to be resumed.
+    """
     have = path.stat().st_size if path.exists() else 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
-    with urllib.request.urlopen(request) as answer:
+    with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
         if have and answer.status != 206:
             have = 0
         total = have + int(answer.headers.get("Content-Length", 0))
@@ -80,6 +86,9 @@ def download(url, path):
                 if time.monotonic() - shown > 1.0 or have == total:
                     shown = time.monotonic()
                     print(f"libtorch: {path.name} {have >> 20} of {total >> 20} MiB", file=sys.stderr)
+    # A connection that breaks ends read() as the end of the file does.
+    if have < total:
+        raise ConnectionError(f"the connection ended after {have} of {total} bytes")
 
 
 def fetch(requirement, digest, folder):
@@ -90,10 +99,12 @@ def fetch(requirement, digest, folder):
             return path
         try:
             download(locate(requirement), path)
-        except OSError as error:
-            print(f"libtorch: {name}: {error}; trying again", file=sys.stderr)
-            time.sleep(2**attempt)
-            continue
+        except (OSError, http.client.HTTPException) as error:
+            if getattr(error, "code", None) != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
+                print(f"libtorch: {name}: {error}; trying again", file=sys.stderr)
+                time.sleep(2**attempt)
+                continue
+            # Nothing is missing: the full length is there.
         if sha256(path) == digest:
             return path
         print(f"libtorch: {name}: sha256 differs, starting over", file=sys.stderr)
@@ -119,17 +130,25 @@ def unpack(wheel, members, folder):
                     shutil.copyfileobj(reader, writer, CHUNK_BYTES)
 
 
+# Written last, it names what was unpacked: complete or absent.
+STAMP = "planesweep-complete"
+STAMPED = "\n".join(digest for _, digest, _ in WHEELS)
+
+
+def is_complete(cache):
+    stamp = cache / STAMP
+    return stamp.exists() and stamp.read_text() == STAMPED
+
+
 def main():
-    cache = pathlib.Path(sys.argv[1])
-    # The stamp is written last and names what was unpacked: complete or absent.
-    stamp = cache / "planesweep-complete"
-    wanted = "\n".join(digest for _, digest, _ in WHEELS)
-    if stamp.exists() and stamp.read_text() == wanted:
-        return
+    cache = pathlib.Path(sys.argv[-1])
+    if sys.argv[1] == "--check":
+        sys.exit(not is_complete(cache))
     cache.parent.mkdir(parents=True, exist_ok=True)
     with open(cache.with_name(cache.name + ".lock"), "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if stamp.exists() and stamp.read_text() == wanted:
+        # Another process may have filled it meanwhile.
+        if is_complete(cache):
             return
         downloads = cache.with_name(cache.name + ".download")
         downloads.mkdir(exist_ok=True)
@@ -137,7 +156,7 @@ def main():
         shutil.rmtree(fresh, ignore_errors=True)
         for requirement, digest, members in WHEELS:
             unpack(fetch(requirement, digest, downloads), members, fresh)
-        (fresh / stamp.name).write_text(wanted)
+        (fresh / STAMP).write_text(STAMPED)
         shutil.rmtree(cache, ignore_errors=True)
         fresh.rename(cache)
         shutil.rmtree(downloads)
