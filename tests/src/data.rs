@@ -11,13 +11,8 @@ pub fn shared_data(test: &str, path: &str) -> Option<PathBuf> {
     if found.exists() {
         return Some(found);
     }
-    skipped(test, path);
+    eprintln!("SKIPPED {test}: {path} is not there");
     None
-}
-
-/// Says that a test does nothing because `what` is missing.
-pub fn skipped(test: &str, what: &str) {
-    eprintln!("SKIPPED {test}: {what} is not there");
 }
 
 /// The reference weights, imported into `folder` by the program; `None` where the checkpoint is missing.

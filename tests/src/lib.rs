@@ -5,6 +5,7 @@
 #![warn(missing_docs)]
 #![allow(clippy::missing_panics_doc, reason = "a helper that cannot do its work fails the test")]
 
+mod bench;
 mod convert_middlebury;
 mod convert_rgbd;
 mod data;
@@ -13,9 +14,10 @@ mod program;
 mod results;
 mod scenes;
 
+pub use bench::Bench;
 pub use convert_middlebury::{Bounds, convert_middlebury};
 pub use convert_rgbd::convert_rgbd;
-pub use data::{reference_weights, shared_data, skipped};
+pub use data::{reference_weights, shared_data};
 pub use faults::{children, is_alive, send, wait_until};
 pub use program::{Finished, Running, run};
 pub use results::{blobs, confident_share, files_below};

@@ -86,9 +86,8 @@ impl Running {
     /// Waits for its end.
     #[track_caller]
     pub fn wait(mut self) -> Finished {
-        if !wait_until(DEADLINE, || !self.is_running()) {
-            panic!("still running after {DEADLINE:?}: {}", self.stderr());
-        }
+        let has_ended = wait_until(DEADLINE, || !self.is_running());
+        assert!(has_ended, "still running after {DEADLINE:?}: {}", self.stderr());
         let code = self.child.wait().expect("it has ended").code();
         Finished { code, stdout: self.read("stdout"), stderr: self.stderr() }
     }
