@@ -6,20 +6,20 @@ use planesweep_scene::{Camera, DepthHypotheses};
 use crate::InferInput;
 
 /// Hypotheses whose probabilities make the confidence, unless they are finer than in training.
-pub(crate) const CONFIDENCE_WINDOW: u32 = 4;
+const CONFIDENCE_WINDOW: u32 = 4;
 
 /// How many probabilities make the confidence of this input, for weights trained with hypotheses of this spacing, in
 /// pixels of the best source view.
 pub(crate) fn window_of(trained_px: Option<f64>, input: InferInput<'_>) -> u32 {
     input.sources.first().map_or(CONFIDENCE_WINDOW, |source| {
         let spacing_px = spacing_px(&input.reference.camera, &source.camera, input.hypotheses);
-        confidence_window(trained_px, spacing_px)
+        widened(trained_px, spacing_px)
     })
 }
 
 /// How many probabilities make the confidence: those that cover as much of the source image as four
 /// hypotheses did in training, and never fewer than four. Spacings are in pixels of the best source view.
-pub(crate) fn confidence_window(trained_px: Option<f64>, spacing_px: f64) -> u32 {
+fn widened(trained_px: Option<f64>, spacing_px: f64) -> u32 {
     let Some(trained_px) = trained_px.filter(|px| px.is_finite() && spacing_px > 0.0 && *px > spacing_px)
     else {
         return CONFIDENCE_WINDOW;
@@ -30,7 +30,7 @@ pub(crate) fn confidence_window(trained_px: Option<f64>, spacing_px: f64) -> u32
 
 /// How far one step in the middle of the hypotheses moves the centre of the reference image in the source, in
 /// pixels of the source; zero when it is not seen there.
-pub(crate) fn spacing_px(reference: &Camera, source: &Camera, hypotheses: &DepthHypotheses) -> f64 {
+fn spacing_px(reference: &Camera, source: &Camera, hypotheses: &DepthHypotheses) -> f64 {
     let size = reference.intrinsics;
     let centre = Point2::new(f64::from(size.width - 1) / 2.0, f64::from(size.height - 1) / 2.0);
     let middle = f64::from(hypotheses.count() / 2);
@@ -50,11 +50,11 @@ mod tests {
 
     #[test]
     fn window_widens_with_finer_hypotheses_only() {
-        assert_eq!(confidence_window(None, 0.1), 4);
-        assert_eq!(confidence_window(Some(1.0), 1.5), 4);
-        assert_eq!(confidence_window(Some(1.0), 0.5), 8);
-        assert_eq!(confidence_window(Some(1.0), 0.7), 6);
-        assert_eq!(confidence_window(Some(1.0), 0.0), 4);
+        assert_eq!(widened(None, 0.1), 4);
+        assert_eq!(widened(Some(1.0), 1.5), 4);
+        assert_eq!(widened(Some(1.0), 0.5), 8);
+        assert_eq!(widened(Some(1.0), 0.7), 6);
+        assert_eq!(widened(Some(1.0), 0.0), 4);
     }
 
     #[test]

@@ -8,7 +8,7 @@ use planesweep_scene::{Camera, DepthMap, Raster, WorkingImage};
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 use thiserror::Error;
 
-use crate::backend::quarter;
+use crate::backend::{quarter, quarter_camera};
 use crate::bands::{
     FeatureLayers, InferCost, InferSize, Regularization, RegularizationLayers, VolumeTimes, features,
     predict, refined, refinement_layers, rows_for_depth, rows_for_refinement,
@@ -152,48 +152,33 @@ impl CpuBackend {
         Ok(maps.cropped(&rows, camera, &color))
     }
 
-    fn run(&mut self, input: InferInput<'_>, rows: &Range<usize>) -> Result<Maps, InferError> {
-        if input.sources.is_empty() {
-            return Err(InferError::NoSources);
+    /// The probability of each hypothesis, nearest first, at a pixel of the depth map (paper figure 3c).
+    pub fn probability(&mut self, input: InferInput<'_>, x: usize, y: usize) -> Result<Vec<f32>, InferError> {
+        let intrinsics = quarter_camera(input.reference).intrinsics;
+        let (width, height) = (intrinsics.width as usize, intrinsics.height as usize);
+        if x >= width || y >= height {
+            return Err(InferError::PixelOutside { x, y, width, height });
         }
-        let begin = Instant::now();
-        let pool = Arc::default();
-        let reference = self.feature_map(&pool, input.reference);
-        let maps: Vec<_> = input.sources.iter().map(|source| self.feature_map(&pool, source)).collect();
-        drop(pool);
-        self.times = InferTimes { features: begin.elapsed(), ..InferTimes::default() };
-
-        let projection = |image| quarter(image).0.projection();
-        let own = projection(input.reference);
-        let mut sources = Vec::with_capacity(maps.len());
-        for (map, source) in maps.iter().zip(input.sources) {
-            let sweep = PixelSweep::new(&own, &projection(source)).ok_or(InferError::SingularCamera)?;
-            sources.push((map.as_ref(), sweep));
-        }
-        let inverse_depths = input.hypotheses.depths().iter().map(|depth| 1.0 / depth).collect();
-        let cost = CostInput { reference: &reference, sources, inverse_depths, metric: self.metric };
+        let maps = self.feature_maps(input)?;
         let window = self.confidence_window(input);
+        let swept = self.sweep(&self.cost(&maps, input)?, y..y + 1, window, Some((x, y)));
+        Ok(swept.probability)
+    }
+
+    fn run(&mut self, input: InferInput<'_>, rows: &Range<usize>) -> Result<Maps, InferError> {
+        let begin = Instant::now();
+        let maps = self.feature_maps(input)?;
+        let features = begin.elapsed();
+        let (width, height) = (maps[0].width(), maps[0].height());
         let unrefined = match &self.refinement {
-            Some(_) => rows_for_refinement(rows, reference.height()),
+            Some(_) => rows_for_refinement(rows, height),
             None => rows.clone(),
         };
-        let depths = cost.inverse_depths.len();
-        let pool = Arc::default();
-        let size = InferSize {
-            width: 4 * reference.width(),
-            height: 4 * reference.height(),
-            depths,
-            views: input.sources.len() + 1,
-        };
-        let step_rows = self.step_rows(size);
-        let (pixels, times) =
-            self.threads.install(|| self.sweep(&pool, &cost, &unrefined, window, step_rows));
-        self.times.cost = times.cost;
-        self.times.regularization = times.regularization;
-        self.times.regression = times.regression;
+        let window = self.confidence_window(input);
+        let Swept { pixels, times, .. } =
+            self.sweep(&self.cost(&maps, input)?, unrefined.clone(), window, None);
 
         let begin = Instant::now();
-        let width = reference.width();
         let own = (rows.start - unrefined.start) * width..(rows.end - unrefined.start) * width;
         let indices = pixels.iter().map(|pixel| pixel.index);
         let indices: Vec<f64> = match &self.refinement {
@@ -210,32 +195,70 @@ impl CpuBackend {
         let depth =
             indices[own.clone()].iter().map(|index| input.hypotheses.depth_at(*index) as f32).collect();
         let confidence = pixels[own].iter().map(|pixel| pixel.confidence).collect();
-        self.times.refinement = begin.elapsed();
+        let VolumeTimes { cost, regularization, regression } = times;
+        let refinement = begin.elapsed();
+        self.times = InferTimes { features, cost, regularization, regression, refinement };
         Ok(Maps { depth, confidence })
     }
 
-    /// The pixels of some rows of the unrefined depth map.
+    /// The features of the reference, then of the sources.
+    fn feature_maps(&mut self, input: InferInput<'_>) -> Result<Vec<Arc<FeatureMap>>, InferError> {
+        if input.sources.is_empty() {
+            return Err(InferError::NoSources);
+        }
+        let pool = Arc::default();
+        let images = std::iter::once(input.reference).chain(input.sources.iter().copied());
+        Ok(images.map(|image| self.feature_map(&pool, image)).collect())
+    }
+
+    fn cost<'a>(
+        &self,
+        maps: &'a [Arc<FeatureMap>],
+        input: InferInput<'_>,
+    ) -> Result<CostInput<'a>, InferError> {
+        let projection = |image| quarter_camera(image).projection();
+        let own = projection(input.reference);
+        let mut sources = Vec::with_capacity(input.sources.len());
+        for (map, source) in maps[1..].iter().zip(input.sources) {
+            let sweep = PixelSweep::new(&own, &projection(source)).ok_or(InferError::SingularCamera)?;
+            sources.push((map.as_ref(), sweep));
+        }
+        let inverse_depths = input.hypotheses.depths().iter().map(|depth| 1.0 / depth).collect();
+        Ok(CostInput { reference: &maps[0], sources, inverse_depths, metric: self.metric })
+    }
+
+    /// Some rows of the unrefined depth map, and the probabilities of one of their pixels.
     fn sweep(
         &self,
-        pool: &Arc<Pool>,
         cost: &CostInput<'_>,
-        rows: &Range<usize>,
+        rows: Range<usize>,
         window: u32,
-        step_rows: usize,
-    ) -> (Vec<Regressed>, VolumeTimes) {
+        probe: Option<(usize, usize)>,
+    ) -> Swept {
         let (width, height) = (cost.reference.width(), cost.reference.height());
-        let needed = rows_for_depth(rows, height);
-        let size = (width, needed.len(), cost.inverse_depths.len());
-        let mut volume = Regularization::new(pool, &self.regularization, self.level, size, window);
-        let mut pixels = Vec::with_capacity(needed.len() * width);
-        let mut taken = 0;
-        while taken < needed.len() {
-            let count = step_rows.min(needed.len() - taken);
-            pixels.extend(volume.push(cost, needed.start, count));
-            taken += count;
+        let (depths, views) = (cost.inverse_depths.len(), cost.sources.len() + 1);
+        let step_rows = self.step_rows(InferSize { width: 4 * width, height: 4 * height, depths, views });
+        let needed = rows_for_depth(&rows, height);
+        let mut volume = Regularization::new(
+            &Arc::default(),
+            &self.regularization,
+            self.level,
+            (width, needed.len(), depths),
+            window,
+        );
+        if let Some((x, y)) = probe {
+            volume.regression.probe(x, y - needed.start);
         }
+        let mut pixels = Vec::with_capacity(needed.len() * width);
+        self.threads.install(|| {
+            for begin in needed.clone().step_by(step_rows) {
+                let count = step_rows.min(needed.end - begin);
+                pixels.extend(volume.push(cost, needed.start, count));
+            }
+        });
         let own = (rows.start - needed.start) * width..(rows.end - needed.start) * width;
-        (pixels[own].to_vec(), volume.times)
+        let probability = volume.regression.probability().unwrap_or_default().to_vec();
+        Swept { pixels: pixels[own].to_vec(), probability, times: volume.times }
     }
 
     fn feature_map(&mut self, pool: &Arc<Pool>, image: &WorkingImage) -> Arc<FeatureMap> {
@@ -257,6 +280,14 @@ impl CpuBackend {
         }
         guide
     }
+}
+
+/// What a sweep gives.
+struct Swept {
+    pixels: Vec<Regressed>,
+    /// Of the pixel that was asked for.
+    probability: Vec<f32>,
+    times: VolumeTimes,
 }
 
 /// Depth and confidence of some rows, of the width of the features.
@@ -374,6 +405,25 @@ mod tests {
                 DepthHypotheses::new(Sampling::Inverse, 2.0, 8.0, count).expect("a valid range");
             assert!(images.infer(&mut backend).is_ok(), "{count} hypotheses");
         }
+    }
+
+    #[test]
+    fn probability_at_a_pixel_sums_to_one_and_makes_its_depth() {
+        let images = Images::new(64, 140, Sampling::Uniform);
+        let sources: Vec<_> = images.sources.iter().collect();
+        let input =
+            InferInput { reference: &images.reference, sources: &sources, hypotheses: &images.hypotheses };
+        let mut backend = backend(WeightsMetadata::untrained(Refinement::None), 1);
+        let map = backend.infer(input).expect("a depth map");
+        for (x, y) in [(15, 34), (0, 0), (6, 20)] {
+            let probability = backend.probability(input, x, y).expect("a pixel of the map");
+            assert_eq!(probability.len(), 16);
+            assert!((probability.iter().sum::<f32>() - 1.0).abs() < 1e-5);
+            let index: f64 = probability.iter().zip(0..).map(|(p, k)| f64::from(*p) * f64::from(k)).sum();
+            assert!((images.hypotheses.depth_at(index) - f64::from(map.depth.at(x, y))).abs() < 1e-5);
+        }
+        let outside = backend.probability(input, 15, 35);
+        assert!(matches!(outside, Err(InferError::PixelOutside { height: 35, .. })));
     }
 
     #[test]

@@ -3,8 +3,6 @@
 use planesweep_scene::{DepthHypotheses, Sampling};
 use tch::{Kind, TchError, Tensor};
 
-pub(crate) use crate::confidence::{CONFIDENCE_WINDOW, confidence_window, spacing_px};
-
 /// Probabilities `[D, H, W]` from logits, over depth.
 pub(crate) fn probability(logits: &Tensor) -> Result<Tensor, TchError> {
     logits.f_softmax(0, None)

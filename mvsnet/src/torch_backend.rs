@@ -5,7 +5,7 @@ use tch::{Cuda, Device, Kind, TchError, Tensor};
 use thiserror::Error;
 
 use crate::backend::{quarter, quarter_camera};
-use crate::depth;
+use crate::confidence;
 use crate::input::InputImage;
 use crate::network::{FeatureView, Inference, Network, StepError};
 use crate::{BackendInfo, DepthBackend, InferError, InferInput, Normalization, Weights};
@@ -70,10 +70,7 @@ impl TorchBackend {
     /// How many hypotheses make the confidence for this input: four, or more when the hypotheses are finer than
     /// those of the training.
     pub fn confidence_window(&self, input: InferInput<'_>) -> u32 {
-        input.sources.first().map_or(depth::CONFIDENCE_WINDOW, |source| {
-            let spacing_px = depth::spacing_px(&input.reference.camera, &source.camera, input.hypotheses);
-            depth::confidence_window(self.trained_spacing_px, spacing_px)
-        })
+        confidence::window_of(self.trained_spacing_px, input)
     }
 
     /// The probability of each hypothesis, nearest first, at a pixel of the depth map (paper figure 3c).

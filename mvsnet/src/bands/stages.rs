@@ -283,11 +283,34 @@ pub(crate) struct RegressionStage {
     taken: usize,
     /// The last two of them, or fewer.
     kept: Vec<Row>,
+    /// A pixel whose probabilities are wanted: column and row.
+    probed: Option<(usize, usize)>,
+    /// Its probabilities, once its row is complete.
+    probability: Option<Vec<f32>>,
 }
 
 impl RegressionStage {
     pub(crate) fn new(input: Shape, height: usize, window: u32) -> Self {
-        Self { shape: input, height, window, taken: 0, kept: Vec::new() }
+        Self { shape: input, height, window, taken: 0, kept: Vec::new(), probed: None, probability: None }
+    }
+
+    /// Asks for the probabilities of a pixel, before its row comes.
+    pub(crate) fn probe(&mut self, x: usize, y: usize) {
+        self.probed = Some((x, y));
+    }
+
+    /// The probability of each hypothesis at the pixel asked for, once its row is complete.
+    pub(crate) fn probability(&self) -> Option<&[f32]> {
+        self.probability.as_deref()
+    }
+
+    /// What the pixels at `x` (which is even) and right of it are made of, row by row of the input.
+    fn input(&self, first_kept: usize, x: usize, y: usize) -> Vec<([Column<'_>; 4], usize)> {
+        let rows = (0..3).filter_map(|tap| {
+            let row = self.kept.get((y + tap).checked_sub(first_kept + 1)?)?;
+            Some(([-1, 0, 1, 2].map(|offset| row.column(x as isize + offset)), tap))
+        });
+        rows.collect()
     }
 
     /// The pixels of the next rows.
@@ -299,20 +322,22 @@ impl RegressionStage {
         self.taken += rows.len();
         let width = self.shape.columns;
         let mut pixels = vec![Regressed::default(); (complete(self.taken) - done) * width];
-        let kept = &self.kept;
         pixels.par_chunks_exact_mut(2).enumerate().for_each_init(
             || RegressionScratch::new(self.shape.padded()),
             |scratch, (pair, pixels)| {
                 let (y, x) = (done + 2 * pair / width, 2 * pair % width);
-                let mut input = Vec::with_capacity(3);
-                for tap in 0..3 {
-                    if let Some(row) = (y + tap).checked_sub(first_kept + 1).and_then(|i| kept.get(i)) {
-                        input.push(([-1, 0, 1, 2].map(|offset| row.column(x as isize + offset)), tap));
-                    }
-                }
+                let input = self.input(first_kept, x, y);
                 pixels.copy_from_slice(&layer.apply(&input, self.window, scratch));
             },
         );
+        if let Some((x, y)) = self.probed.filter(|(_, y)| (done..complete(self.taken)).contains(y)) {
+            let mut scratch = RegressionScratch::new(self.shape.padded());
+            layer.apply(&self.input(first_kept, x / 2 * 2, y), self.window, &mut scratch);
+            let exponentials = &scratch.exponentials(x % 2)[..self.shape.length];
+            let total: f64 = exponentials.iter().map(|value| f64::from(*value)).sum();
+            let probability = exponentials.iter().map(|value| (f64::from(*value) / total) as f32);
+            self.probability = Some(probability.collect());
+        }
         let needed = complete(self.taken).saturating_sub(1);
         self.kept.drain(..needed - first_kept.min(needed));
         pixels

@@ -30,7 +30,7 @@ pub(crate) struct Regularization<'a> {
     plain: [PlainStage; 4],
     down: [DownStage; 3],
     up: [UpStage; 3],
-    regression: RegressionStage,
+    pub(crate) regression: RegressionStage,
     pub(crate) times: VolumeTimes,
 }
 

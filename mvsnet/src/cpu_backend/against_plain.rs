@@ -213,7 +213,7 @@ fn as_exact_on_the_golden_case() {
         inverse_depths: hypotheses.depths().iter().map(|depth| 1.0 / depth).collect(),
         metric: CostMetric::Variance,
     };
-    let (pixels, _) = backend.sweep(&Arc::default(), &cost, &(0..128), 4, 8);
+    let Swept { pixels, .. } = backend.sweep(&cost, 0..128, 4, None);
     let ours = Said {
         depth: pixels.iter().map(|pixel| f64::from(hypotheses.depth_at(pixel.index) as f32)).collect(),
         confidence: pixels.iter().map(|pixel| f64::from(pixel.confidence)).collect(),

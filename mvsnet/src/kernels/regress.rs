@@ -37,6 +37,11 @@ impl RegressionScratch {
     pub(crate) fn new(padded: usize) -> Self {
         Self([Aligned::zeroed(padded), Aligned::zeroed(padded)])
     }
+
+    /// What the probabilities of one of the last two pixels are in proportion to.
+    pub(crate) fn exponentials(&self, pixel: usize) -> &[f32] {
+        self.0[pixel].values()
+    }
 }
 
 impl RegressionLayer {
