@@ -1,5 +1,6 @@
 //! Random histories of workers, messages and time against a model of the ledger that is as plain as
-//! its SQL: after each event the invariants of `schedule` hold, and at the end every job has ended.
+//! its SQL: after each event the invariants of `schedule` hold, and at the end every job that a run
+//! wants has ended.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -75,13 +76,13 @@ impl Ledger {
                     Reopening::ResultLost => job.state == LedgerState::Done,
                     Reopening::NewInput => matches!(job.state, LedgerState::Done | LedgerState::Leased(_)),
                 };
+                job.outdated |= *why == Reopening::NewInput;
                 if allowed {
-                    job.outdated |= *why == Reopening::NewInput && job.state == LedgerState::Done;
                     job.state = LedgerState::Open;
                     (job.failures, job.losses, job.suspect, job.deaths_alone) = (0, 0, false, 0);
                     self.published.remove(id);
                 }
-                allowed
+                allowed || *why == Reopening::NewInput
             }
             Command::Renew { job, attempt, worker, .. } => {
                 leased(self, job, attempt) && self.jobs[job].state == LedgerState::Leased(worker.clone())
@@ -380,7 +381,7 @@ impl World {
         }
     }
 
-    /// Workers live and everything they do succeeds: all jobs end.
+    /// Workers live and everything they do succeeds: all jobs that a run wants end.
     fn calm_down(&mut self) {
         for round in 0.. {
             assert!(round < 400, "jobs are left that nobody does");
@@ -392,10 +393,17 @@ impl World {
             }
             self.pass(2000);
             let idle = self.workers.iter().all(|worker| worker.held.is_empty() && worker.finished.is_empty());
-            if idle && !self.snapshot.has_unfinished() {
+            if idle && self.wanted_have_ended() {
                 return;
             }
         }
+    }
+
+    /// What no run wants may be left open: when its result is lost, and what it needs was cancelled.
+    fn wanted_have_ended(&self) -> bool {
+        let mut wanted = self.active.iter().flat_map(|views| plan(*views));
+        wanted
+            .all(|shape| matches!(self.ledger.jobs[&shape.id].state, LedgerState::Done | LedgerState::Failed))
     }
 
     /// Each result of a plan was made of the newest results of what it needs.

@@ -107,13 +107,17 @@ impl Step {
                  WHERE id = $1 AND state = 'done'",
             ),
             Reopening::NewInput => sqlx::query(
-                "UPDATE jobs SET outdated = CASE state WHEN 'done' THEN 1 ELSE outdated END,
-                                 state = 'open', worker = NULL, ended = 0, failures = 0, losses = 0, suspect = 0, deaths_alone = 0,
+                "UPDATE jobs SET state = 'open', worker = NULL, ended = 0, failures = 0, losses = 0, suspect = 0, deaths_alone = 0,
                                  blob = NULL, blob_length = NULL
                  WHERE id = $1 AND state IN ('done', 'leased')",
             ),
         };
-        self.changed("reopen a job", query.bind(job.0.to_vec())).await
+        let changed = self.changed("reopen a job", query.bind(job.0.to_vec())).await?;
+        if why != Reopening::NewInput {
+            return Ok(changed);
+        }
+        let query = sqlx::query("UPDATE jobs SET outdated = 1 WHERE id = $1").bind(job.0.to_vec());
+        self.changed("mark a job as outdated", query).await
     }
 
     /// Gives an open job to a worker, as the attempt that follows its latest one.

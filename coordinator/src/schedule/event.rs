@@ -144,7 +144,8 @@ pub enum Reopening {
     Resubmitted,
     /// Its result is gone from the store.
     ResultLost,
-    /// It ended without, or with an older, result of a job that has one now.
+    /// It ended without, or with an older, result of a job that has one now. In any state, its own
+    /// next result counts as new to those that need it, for it may have lost an older one that they saw.
     NewInput,
 }
 

@@ -29,7 +29,7 @@
 //! - A job fails for good by itself, after [`MAX_FAILURES`] failures that count, after
 //!   [`MAX_LOSSES`] tries that found an input lost, after [`MAX_DEATHS_ALONE`] deaths of workers that
 //!   held nothing else, or when the ledger cannot give it out; not by anything else.
-//! - While a worker that takes its class lives and reports, every job ends.
+//! - While a worker that takes its class lives and reports, every job that a run wants ends.
 
 mod assign;
 mod event;

@@ -95,13 +95,11 @@ fn settle(
 }
 
 /// Those who ended, or are just running, without this result run again. Their own dependents
-/// follow when they complete, for they are outdated in turn.
+/// follow when they complete, for they are outdated in turn; so are those who wait to run again.
 fn reopen_dependents(snapshot: &Snapshot, job: &Job, commands: &mut Vec<Command>) {
     for dependent in &job.dependents {
         let dependent = &snapshot.jobs[*dependent as usize];
-        if matches!(dependent.state, State::Done | State::Leased { .. }) {
-            commands.push(Command::Reopen { job: dependent.id, why: Reopening::NewInput });
-        }
+        commands.push(Command::Reopen { job: dependent.id, why: Reopening::NewInput });
     }
 }
 

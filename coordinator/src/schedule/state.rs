@@ -360,12 +360,12 @@ impl Snapshot {
             Reopening::ResultLost => job.state == State::Done,
             Reopening::NewInput => matches!(job.state, State::Done | State::Leased { .. }),
         };
+        // A lost result comes back as it was; with a new input it may differ.
+        job.outdated |= why == Reopening::NewInput;
         if !allowed {
-            return false;
+            return why == Reopening::NewInput;
         }
         (job.failures, job.losses, job.suspect, job.deaths_alone) = (0, 0, false, 0);
-        // A lost result comes back as it was; with a new input it may differ.
-        job.outdated |= why == Reopening::NewInput && had_ended;
         self.drop_from_holder(ordinal);
         if had_ended {
             self.tell_dependents(ordinal, |unmet| unmet + 1);
