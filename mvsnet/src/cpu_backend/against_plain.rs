@@ -108,7 +108,7 @@ fn ours(weights: &Weights, images: &Images, level: Level, step_rows: usize) -> S
 fn compare(refinement: Refinement, metric: CostMetric, sampling: Sampling, level: Level) {
     let (mut all_ours, mut all_plain, mut truth) = <(Said, Said, Said)>::default();
     for (width, height, depths, step_rows, seed) in
-        [(96, 64, 16, 3, 1), (150, 70, 27, 8, 2), (64, 190, 48, 5, 3), (33, 47, 9, 1, 4)]
+        [(96, 64, 16, 3, 1), (150, 70, 27, 8, 2), (64, 190, 48, 5, 3), (33, 47, 9, 1, 4), (20, 25, 5, 2, 5)]
     {
         let metadata = WeightsMetadata { metric, ..WeightsMetadata::untrained(refinement) };
         let weights = Weights::seeded(metadata, seed);
