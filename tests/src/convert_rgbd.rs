@@ -12,6 +12,10 @@ use planesweep_scene::{
     write_pfm,
 };
 
+/// The fewest that a plan takes: between neighbouring frames a point moves by a few pixels only, and
+/// planes much finer than a pixel tell the network nothing.
+const PLANES: u32 = 64;
+
 /// Converts the sequence in `source` with the intrinsics of the JSON file `camera`, and writes true
 /// depth in metres to depth_gt/. Depth ranges are those of the sensor, widened by a tenth.
 pub fn convert_rgbd(source: &Path, camera: &Path, target: &Path) {
@@ -41,7 +45,11 @@ pub fn convert_rgbd(source: &Path, camera: &Path, target: &Path) {
             image,
             camera: Camera { intrinsics, pose },
             distortion: Distortion::None,
-            depth_range: Some(DepthRange { min: 0.9 * near as f64, max: 1.1 * far as f64, count: None }),
+            depth_range: Some(DepthRange {
+                min: 0.9 * near as f64,
+                max: 1.1 * far as f64,
+                count: Some(PLANES),
+            }),
         };
         scene.views.insert(view.id, view);
     }

@@ -79,8 +79,7 @@ fn an_rgbd_sequence() {
     convert_rgbd(&source.join("RGBD"), &source.join("camera_primesense.json"), &scene);
     // From the first view to the last, two pixels of the depth map are all that a point at the middle
     // distance moves, so that full size is needed and a tenth of a pixel is some 5 % of depth.
-    let full = ["--views", "5", "--depths", "96"];
-    let Some((value, out)) = reconstruct(test, &folder, &scene, &full) else { return };
+    let Some((value, out)) = reconstruct(test, &folder, &scene, &["--views", "5"]) else { return };
     assert_eq!(value["report"]["views"].as_array().map(Vec::len), Some(5));
     let (median, share) = confident_error(&out, &scene.join("depth_gt"));
     assert!(median < 0.15 && share > 0.05, "median relative error {median} of a share of {share}");
