@@ -228,7 +228,6 @@ impl PlanArgs {
                 max_relative_depth: f.max_depth_difference,
                 sampling: if f.continuous { DepthSampling::Continuous } else { DepthSampling::Bilinear },
             }),
-            threads: defaults.threads,
         }
     }
 }
@@ -240,9 +239,29 @@ pub struct NetworkArgs {
     /// The weights, as `weights import` writes them.
     #[arg(long, env = "PLANESWEEP_WEIGHTS", value_name = "FILE")]
     pub weights: PathBuf,
-    /// Where to infer: cpu, cuda or cuda:N.
+    /// Where to infer: cpu, torch (the plain network of libtorch on the processor), cuda or cuda:N.
     #[arg(long, default_value = "cpu")]
     pub device: String,
+    /// Memory for inference, such as 800M or 2G, shared by all workers; less than the least that is
+    /// possible is taken for that. Changes no bit of the result.
+    #[arg(long, value_name = "SIZE", value_parser = bytes)]
+    pub memory: Option<u64>,
+}
+
+/// A size in bytes: a number with K, M, G or T (powers of 1024) behind it or without.
+fn bytes(text: &str) -> Result<u64, String> {
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let shift = match text[digits.len()..].trim_end_matches(['B', 'b', 'i']).to_ascii_uppercase().as_str() {
+        "" => 0,
+        "K" => 10,
+        "M" => 20,
+        "G" => 30,
+        "T" => 40,
+        _ => return Err(format!("{text} is no size; write it like 800M or 2G")),
+    };
+    let number: f64 = digits.parse().map_err(|_| format!("{text} is no size; write it like 800M or 2G"))?;
+    let size = number * (1_u64 << shift) as f64;
+    if (1.0..1e18).contains(&size) { Ok(size as u64) } else { Err(format!("{text} is no size")) }
 }
 
 /// Arguments of `reconstruct`.
@@ -260,6 +279,9 @@ pub struct ReconstructArgs {
     /// Worker processes; by default as many as make the machine busy and fit into its memory.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=256))]
     pub workers: Option<u32>,
+    /// Threads of each worker's inference; by default the processors are shared evenly.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
     /// Forget what an earlier run in the same folder has done.
     #[arg(long)]
     pub fresh: bool,
@@ -411,9 +433,15 @@ pub struct WorkerArgs {
     /// Which jobs it takes.
     #[arg(long, value_enum, default_value = "both")]
     pub role: RoleArg,
-    /// Where to infer: cpu, cuda or cuda:N; `analytic` is a test double that knows a plane at depth 5.
+    /// Where to infer: cpu, torch, cuda or cuda:N; `analytic` is a test double that knows a plane.
     #[arg(long, default_value = "cpu")]
     pub device: String,
+    /// Threads of an inference; by default all processors.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
+    /// Memory for inference, such as 800M or 2G.
+    #[arg(long, value_name = "SIZE", value_parser = bytes)]
+    pub memory: Option<u64>,
     /// Stop when standard input ends, that is, when the process that started this one is gone.
     #[arg(long, hide = true)]
     pub stop_with_stdin: bool,
@@ -467,6 +495,9 @@ mod tests {
         assert!(refused("--min-views", "0") && refused("--min-confidence", "nan"));
         assert!(refused("--max-reprojection", "-1") && refused("--max-depth-difference", "inf"));
         assert!(!refused("--min-confidence", "0.5"));
+        assert!(refused("--memory", "2X") && refused("--memory", "-1G"));
+        assert_eq!(bytes("1.5G"), Ok(3 << 29));
+        assert_eq!(bytes("800MiB"), Ok(800 << 20));
     }
 
     #[test]

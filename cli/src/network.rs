@@ -4,8 +4,10 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 use nalgebra::Vector3;
-use planesweep_mvsnet::{AnalyticBackend, DepthBackend, TorchBackend, Weights};
-use planesweep_plan::Plan;
+use planesweep_mvsnet::{
+    AnalyticBackend, CpuBackend, DepthBackend, InferCost, InferSize, TorchBackend, Weights,
+};
+use planesweep_plan::{Plan, ViewPlan};
 use planesweep_worker::BackendFactory;
 
 /// The device of the test double.
@@ -29,39 +31,75 @@ pub fn read_weights(path: &Path) -> Result<(Vec<u8>, Weights)> {
     Ok((bytes, weights))
 }
 
-/// Makes networks on a device, such as "cpu", "cuda" or "cuda:1".
-pub fn backend_factory(device: &str) -> Result<BackendFactory> {
-    if device == ANALYTIC {
-        return Ok(Box::new(|_, _| Ok(Box::new(AnalyticBackend::new(Vector3::z(), ANALYTIC_DEPTH)))));
-    }
-    if device != "cpu" && device != "cuda" && !device.starts_with("cuda:") {
-        bail!("device \"{device}\" is none of cpu, cuda and cuda:N");
-    }
-    let device = device.to_owned();
-    Ok(Box::new(move |bytes, threads| {
-        let weights = Weights::from_bytes(bytes)?;
-        let backend: Box<dyn DepthBackend> =
-            Box::new(TorchBackend::new(&weights, &device, threads as usize)?);
-        Ok(backend)
-    }))
+/// How a network is run.
+#[derive(Clone, Debug)]
+pub struct Placement {
+    /// "cpu" (kernels of our own), "torch" (the plain network of libtorch on the processor), "cuda" or
+    /// "cuda:N".
+    pub device: String,
+    /// Threads of one inference; they change no bit of the result.
+    pub threads: usize,
+    /// What one inference may hold in memory, where the device can choose.
+    pub memory_bytes: Option<u64>,
 }
 
-/// What a worker needs beside the network's volumes.
-const WORKER_BYTES: u64 = 500 << 20;
+/// Makes networks.
+pub fn backend_factory(placement: &Placement) -> Result<BackendFactory> {
+    let Placement { device, threads, memory_bytes } = placement.clone();
+    match device.as_str() {
+        ANALYTIC => Ok(Box::new(|_| Ok(Box::new(AnalyticBackend::new(Vector3::z(), ANALYTIC_DEPTH))))),
+        "cpu" => Ok(Box::new(move |bytes| {
+            let weights = Weights::from_bytes(bytes)?;
+            let backend: Box<dyn DepthBackend> = Box::new(CpuBackend::new(&weights, threads, memory_bytes)?);
+            Ok(backend)
+        })),
+        name if name == "torch" || name == "cuda" || name.starts_with("cuda:") => {
+            let device = if name == "torch" { "cpu".to_owned() } else { name.to_owned() };
+            Ok(Box::new(move |bytes| {
+                let weights = Weights::from_bytes(bytes)?;
+                let backend: Box<dyn DepthBackend> = Box::new(TorchBackend::new(&weights, &device, threads)?);
+                Ok(backend)
+            }))
+        }
+        _ => bail!("device \"{device}\" is none of cpu, torch, cuda and cuda:N"),
+    }
+}
+
+/// What a worker needs beside its inference: images, depth maps, the program itself.
+const WORKER_BYTES: u64 = 400 << 20;
 /// The plain network's peak, in bytes per voxel of the padded volume: the cost volume of 32 floats
 /// and what is alive beside it.
-const BYTES_PER_VOXEL: u64 = 32 * 4 * 2;
+const PLAIN_BYTES_PER_VOXEL: u64 = 32 * 4 * 2;
+
+/// Sizes of the inference of a view.
+pub fn infer_size(view: &ViewPlan) -> InferSize {
+    InferSize {
+        width: view.working_size.0 as usize,
+        height: view.working_size.1 as usize,
+        depths: view.hypotheses.count() as usize,
+        views: view.sources.len() + 1,
+    }
+}
 
 /// As many workers as there are processors, while the memory that is available holds them.
-pub fn default_workers(plan: &Plan) -> u32 {
-    let processors = std::thread::available_parallelism().map_or(1, usize::from) as u64;
-    let voxels = plan.views.iter().map(|view| {
-        let quarter = |side: u32| u64::from(side.next_multiple_of(32) / 4);
-        let (width, height) = view.working_size;
-        quarter(width) * quarter(height) * u64::from(view.hypotheses.count())
-    });
-    let worker_bytes = WORKER_BYTES + BYTES_PER_VOXEL * voxels.max().unwrap_or(0);
-    (available_bytes() / worker_bytes).clamp(1, processors).min(plan.views.len().max(1) as u64) as u32
+pub fn default_workers(plan: &Plan, device: &str) -> u32 {
+    let inference_bytes = |view: &ViewPlan| {
+        let size = infer_size(view);
+        if device == "cpu" {
+            InferCost::predict(size, 1, None).bytes
+        } else {
+            let quarter = |side: usize| side.next_multiple_of(32) as u64 / 4;
+            quarter(size.width) * quarter(size.height) * size.depths as u64 * PLAIN_BYTES_PER_VOXEL
+        }
+    };
+    let worker_bytes = WORKER_BYTES + plan.views.iter().map(inference_bytes).max().unwrap_or(0);
+    let most = (processors() as u64).min(plan.views.len().max(1) as u64);
+    (available_bytes() / worker_bytes).clamp(1, most) as u32
+}
+
+/// Processors of this machine that the program may use.
+pub fn processors() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
 }
 
 /// Memory that is free or can be freed, in bytes: the machine's, or the container's where that is less.

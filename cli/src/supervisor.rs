@@ -8,6 +8,8 @@ use tokio::process::{Child, Command};
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
+use crate::network::Placement;
+
 /// A worker that dies at once is not started again at once.
 const RESTART_PAUSE: Duration = Duration::from_millis(500);
 /// How long a worker may take to go when nothing is left to do; one that takes longer is frozen.
@@ -30,13 +32,17 @@ impl Supervisor {
     ///
     /// Each holds the reading end of a pipe from this process, so it notices when this one is gone,
     /// however that happened.
-    pub fn start(count: u32, url: &str, device: &str, verbose: u8) -> Result<Self> {
+    pub fn start(count: u32, url: &str, placement: &Placement, verbose: u8) -> Result<Self> {
         let program = std::env::current_exe().context("cannot find the program to start workers with")?;
         let orders = Orders { stop: CancellationToken::new(), kill: CancellationToken::new() };
         let mut slots = JoinSet::new();
         for slot in 0..count {
             let mut command = Command::new(&program);
-            command.args(["worker", "--stop-with-stdin", "--coordinator", url, "--device", device]);
+            command.args(["worker", "--stop-with-stdin", "--coordinator", url]);
+            command.args(["--device", &placement.device, "--threads", &placement.threads.to_string()]);
+            if let Some(bytes) = placement.memory_bytes {
+                command.args(["--memory", &bytes.to_string()]);
+            }
             command.args(std::iter::repeat_n("-v", verbose.into()));
             command.stdin(Stdio::piped()).stdout(Stdio::null()).kill_on_drop(true);
             slots.spawn(keep_alive(slot, command, orders.clone()));

@@ -10,8 +10,8 @@ use thiserror::Error;
 
 use crate::backend::{quarter, quarter_camera};
 use crate::bands::{
-    FeatureLayers, InferCost, InferSize, Regularization, RegularizationLayers, VolumeTimes, features,
-    predict, refined, refinement_layers, rows_for_depth, rows_for_refinement,
+    FeatureLayers, InferCost, InferSize, Regularization, RegularizationLayers, STEP_ROWS, VolumeTimes,
+    features, predict, refined, refinement_layers, rows_for_depth, rows_for_refinement, step_rows,
 };
 use crate::confidence;
 use crate::feature_cache::FeatureCache;
@@ -23,8 +23,6 @@ use crate::kernels::slab::Pool;
 use crate::kernels::winograd::WinogradLayer;
 use crate::{BackendInfo, CostMetric, DepthBackend, InferError, InferInput, Normalization, Weights};
 
-/// Rows of the volume taken at a time, unless memory is short.
-const STEP_ROWS: usize = 8;
 /// Bytes of features that are kept for later inferences, unless memory is short.
 const CACHE_BYTES: usize = 256 << 20;
 
@@ -130,9 +128,7 @@ impl CpuBackend {
 
     /// As many rows at a time as the memory allows.
     fn step_rows(&self, size: InferSize) -> usize {
-        let threads = self.threads.current_num_threads();
-        let fits = |rows| self.memory_bytes.is_none_or(|limit| predict(size, threads, rows).bytes <= limit);
-        (1..=self.step_rows).rev().find(|rows| fits(*rows)).unwrap_or(1)
+        step_rows(size, self.threads.current_num_threads(), self.memory_bytes, self.step_rows)
     }
 
     /// Where the time of the last inference went.

@@ -47,9 +47,6 @@ pub struct InferSpec {
     pub hypotheses: DepthHypotheses,
     /// The weights file in the store.
     pub weights: BlobKey,
-    /// Threads of one inference. Fixed by the plan, because libtorch does not promise the same bits
-    /// for another number.
-    pub threads: u32,
 }
 
 /// An image as the network wants it: undistorted, then resized to the working size.

@@ -56,7 +56,6 @@ pub fn jobs(
             sources: view.sources.iter().map(|source| image(*source)).collect::<Result<_, _>>()?,
             hypotheses: view.hypotheses,
             weights,
-            threads: plan.options.threads,
         };
         infer.push(job(JobSpec::Infer(spec), Vec::new()));
     }
@@ -100,7 +99,6 @@ fn job(spec: JobSpec, needs: Vec<JobId>) -> Job {
             }
             digest.hypotheses(&infer.hypotheses);
             digest.bytes(&infer.weights.0);
-            digest.u32(infer.threads);
         }
         JobSpec::Filter(filter) => {
             let options = filter.options;

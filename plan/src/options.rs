@@ -40,8 +40,6 @@ pub struct PlanOptions {
     pub depth_range: Option<(f64, f64)>,
     /// Thresholds of the filters.
     pub filter: FilterOptions,
-    /// Threads of one inference; see [`crate::InferSpec::threads`].
-    pub threads: u32,
 }
 
 impl Default for PlanOptions {
@@ -54,7 +52,6 @@ impl Default for PlanOptions {
             sampling: SamplingChoice::Auto,
             depth_range: None,
             filter: FilterOptions::default(),
-            threads: 1,
         }
     }
 }

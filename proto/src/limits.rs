@@ -17,8 +17,6 @@ pub const MAX_SOURCES: usize = 64;
 pub const MAX_PLANES: u32 = 4096;
 /// Columns or rows of an image.
 pub const MAX_SIDE: u32 = 1 << 17;
-/// Threads of one inference.
-pub const MAX_THREADS: u32 = 1024;
 /// Free slots of one class that a worker may report.
 pub const MAX_SLOTS: u32 = 256;
 /// Jobs that a worker may report as held, or as finished.

@@ -13,9 +13,9 @@ use planesweep_scene::{DepthHypotheses, DepthMap, WorkingImage};
 use thiserror::Error;
 use tokio::sync::{mpsc, oneshot};
 
-/// Makes the network from a weights file, for a number of threads; called on the device's thread.
+/// Makes the network from a weights file; called on the device's thread.
 pub type BackendFactory =
-    Box<dyn Fn(&[u8], u32) -> Result<Box<dyn DepthBackend>, Box<dyn std::error::Error + Send + Sync>> + Send>;
+    Box<dyn Fn(&[u8]) -> Result<Box<dyn DepthBackend>, Box<dyn std::error::Error + Send + Sync>> + Send>;
 
 /// Why the device gave no depth map.
 #[derive(Debug, Error)]
@@ -37,7 +37,6 @@ pub enum DeviceError {
 /// One inference, complete.
 pub(crate) struct InferRequest {
     pub weights: (BlobKey, Bytes),
-    pub threads: u32,
     pub reference: Arc<WorkingImage>,
     pub sources: Vec<Arc<WorkingImage>>,
     pub hypotheses: DepthHypotheses,
@@ -70,12 +69,12 @@ impl Device {
 }
 
 fn run(factory: &BackendFactory, mut queue: mpsc::Receiver<Task>) {
-    let mut loaded: Option<((BlobKey, u32), Box<dyn DepthBackend>)> = None;
+    let mut loaded: Option<(BlobKey, Box<dyn DepthBackend>)> = None;
     while let Some(Task { request, reply }) = queue.blocking_recv() {
-        let wanted = (request.weights.0, request.threads);
+        let wanted = request.weights.0;
         if loaded.as_ref().is_none_or(|(have, _)| *have != wanted) {
             drop(loaded.take());
-            match factory(&request.weights.1, request.threads) {
+            match factory(&request.weights.1) {
                 Ok(backend) => loaded = Some((wanted, backend)),
                 Err(error) => {
                     // The receiver may have given up; then nobody needs to know.

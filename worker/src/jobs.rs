@@ -111,7 +111,6 @@ impl Jobs {
         let begun = Instant::now();
         let request = InferRequest {
             weights: (spec.weights, weights),
-            threads: spec.threads,
             reference,
             sources,
             hypotheses: spec.hypotheses,

@@ -3,16 +3,16 @@
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
-use planesweep_mvsnet::{DepthBackend, InferInput, TorchBackend, Weights};
+use planesweep_mvsnet::{CpuBackend, DepthBackend, InferInput, TorchBackend, Weights};
 use planesweep_plan::{Plan, ViewPlan, plan, working_size};
 use planesweep_scene::{DepthMap, Raster, Scene, ViewId, WorkingImage, read_image};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use crate::args::DepthArgs;
+use crate::args::{DepthArgs, NetworkArgs};
 use crate::console::Outcome;
 use crate::input;
-use crate::network::read_weights;
+use crate::network::{processors, read_weights};
 use crate::out_folder::{MapFiles, OutFolder};
 
 /// Infers and writes one depth map.
@@ -71,14 +71,19 @@ pub fn run(args: &DepthArgs) -> Result<Outcome> {
 
 /// The depth map, and the probability over depth at the probed pixel.
 fn infer(args: &DepthArgs, weights: &Weights, input: InferInput<'_>) -> Result<(DepthMap, Option<Vec<f32>>)> {
-    let threads = std::thread::available_parallelism().map_or(1, usize::from);
-    let mut backend = TorchBackend::new(weights, &args.network.device, threads)?;
+    let probe = args.probe;
+    let NetworkArgs { device, memory, .. } = &args.network;
+    if device == "cpu" {
+        let mut backend = CpuBackend::new(weights, processors(), *memory)?;
+        let map = backend.infer(input).context("cannot infer the depth map")?;
+        let probability = probe.map(|(x, y)| backend.probability(input, x, y)).transpose();
+        return Ok((map, probability.context("cannot probe")?));
+    }
+    let device = if device == "torch" { "cpu" } else { device };
+    let mut backend = TorchBackend::new(weights, device, processors())?;
     let map = backend.infer(input).context("cannot infer the depth map")?;
-    let probability = match args.probe {
-        Some((x, y)) => Some(backend.probability(input, x, y).context("cannot probe")?),
-        None => None,
-    };
-    Ok((map, probability))
+    let probability = probe.map(|(x, y)| backend.probability(input, x, y)).transpose();
+    Ok((map, probability.context("cannot probe")?))
 }
 
 fn find<'a>(scene: &Scene, plan: &'a Plan, wanted: &str) -> Result<&'a ViewPlan> {

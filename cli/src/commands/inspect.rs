@@ -1,6 +1,7 @@
 //! `planesweep inspect`.
 
 use anyhow::Result;
+use planesweep_mvsnet::InferCost;
 use planesweep_plan::{Plan, RangeOrigin, ViewPlan, plan};
 use planesweep_scene::{Distortion, Sampling, Scene};
 use serde_json::json;
@@ -8,6 +9,7 @@ use serde_json::json;
 use crate::args::InspectArgs;
 use crate::console::{Outcome, table};
 use crate::input::{self, all_skipped};
+use crate::network::infer_size;
 
 /// Says what would be done.
 pub fn run(args: &InspectArgs) -> Result<Outcome> {
@@ -41,8 +43,19 @@ pub fn run(args: &InspectArgs) -> Result<Outcome> {
 }
 
 fn rows(scene: &Scene, plan: &Plan) -> Vec<Vec<String>> {
-    let heading =
-        ["view", "image", "lens", "network sees", "depth range", "from", "planes", "sources", "neighbours"];
+    let heading = [
+        "view",
+        "image",
+        "lens",
+        "network sees",
+        "depth range",
+        "from",
+        "planes",
+        "memory",
+        "GFLOP",
+        "neighbours",
+        "sources",
+    ];
     let mut rows = vec![heading.map(str::to_owned).to_vec()];
     let mut views: Vec<&ViewPlan> = plan.views.iter().collect();
     views.sort_by_key(|view| view.view);
@@ -54,6 +67,8 @@ fn row(scene: &Scene, plan: &ViewPlan) -> Vec<String> {
     let view = &scene.views[&plan.view];
     let size = &view.camera.intrinsics;
     let planes = &plan.hypotheses;
+    // On the processor, with one thread.
+    let cost = InferCost::predict(infer_size(plan), 1, None);
     let sources: Vec<&str> = plan.sources.iter().map(|id| scene.views[id].name.as_str()).collect();
     vec![
         view.name.clone(),
@@ -77,7 +92,9 @@ fn row(scene: &Scene, plan: &ViewPlan) -> Vec<String> {
             planes.count(),
             if planes.sampling() == Sampling::Uniform { "uniform" } else { "inverse" }
         ),
-        sources.join(" "),
+        format!("{} MiB", cost.bytes >> 20),
+        format!("{:.0}", cost.operations / 1e9),
         plan.neighbours.len().to_string(),
+        sources.join(" "),
     ]
 }

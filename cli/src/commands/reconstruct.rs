@@ -16,7 +16,7 @@ use super::export::{self, Finished};
 use crate::args::ReconstructArgs;
 use crate::console::{Outcome, Progress};
 use crate::input::{self, Input};
-use crate::network::{backend_factory, default_workers, read_weights, weights_for};
+use crate::network::{Placement, backend_factory, default_workers, processors, read_weights, weights_for};
 use crate::supervisor::Supervisor;
 
 /// How often progress is asked for.
@@ -36,6 +36,13 @@ pub struct Prepared {
     pub jobs: Vec<Job>,
 }
 
+/// The worker processes of a run.
+struct Team {
+    workers: u32,
+    placement: Placement,
+    verbose: u8,
+}
+
 /// Reconstructs a scene.
 pub fn run(args: &ReconstructArgs, json: bool, verbose: u8) -> Result<Outcome> {
     let begun = Instant::now();
@@ -43,8 +50,9 @@ pub fn run(args: &ReconstructArgs, json: bool, verbose: u8) -> Result<Outcome> {
     let (weights_bytes, weights) = read_weights(&args.network.weights)?;
     let weights_bytes = weights_for(&args.network.device, weights_bytes);
     // The workers make their own; this one only says at once when the device is not there.
-    let factory = backend_factory(&args.network.device)?;
-    drop(factory(&weights_bytes, 1).map_err(|e| anyhow!("cannot use device {}: {e}", args.network.device))?);
+    let placement = Placement { device: args.network.device.clone(), threads: 1, memory_bytes: None };
+    let factory = backend_factory(&placement)?;
+    drop(factory(&weights_bytes).map_err(|e| anyhow!("cannot use device {}: {e}", placement.device))?);
     check_out(args)?;
     let input = timed(&mut stages, "read images", || input::read(&args.scene, &args.read.options()))?;
     for warning in &input.scene.warnings {
@@ -57,7 +65,12 @@ pub fn run(args: &ReconstructArgs, json: bool, verbose: u8) -> Result<Outcome> {
     }
     let weights_key = BlobKey::of(&weights_bytes);
     let jobs = jobs(&input.scene, &plan, &input.image_hashes, weights_key)?;
-    let workers = args.workers.unwrap_or_else(|| default_workers(&plan));
+    let workers = args.workers.unwrap_or_else(|| default_workers(&plan, &placement.device));
+    let placement = Placement {
+        threads: args.threads.map_or((processors() / workers as usize).max(1), |threads| threads as usize),
+        memory_bytes: args.network.memory.map(|bytes| bytes / u64::from(workers)),
+        ..placement
+    };
     if !json {
         eprintln!(
             "{} views to infer, {} left out, {workers} workers",
@@ -69,8 +82,14 @@ pub fn run(args: &ReconstructArgs, json: bool, verbose: u8) -> Result<Outcome> {
 
     let (state, _lock) = open_state(&args.out, args.fresh)?;
     let runtime = tokio::runtime::Runtime::new().context("cannot start the runtime")?;
-    let (store, results) =
-        runtime.block_on(compute(args, &state, weights_bytes, &prepared, (workers, verbose), &mut stages))?;
+    let (store, results) = runtime.block_on(compute(
+        args,
+        &state,
+        weights_bytes,
+        &prepared,
+        Team { workers, placement, verbose },
+        &mut stages,
+    ))?;
     let finished =
         Finished { args, prepared: &prepared, store: &store, results: &results, runtime: &runtime };
     export::run(&finished, stages, begun)
@@ -89,7 +108,7 @@ async fn compute(
     state: &Path,
     weights: Vec<u8>,
     prepared: &Prepared,
-    (workers, verbose): (u32, u8),
+    team: Team,
     stages: &mut Stages,
 ) -> Result<(Store, Vec<JobResult>)> {
     let store = Store::open(&format!("file://{}", state.join("store").display()))?;
@@ -109,14 +128,14 @@ async fn compute(
         };
         let submitted =
             coordinator.submit(header, prepared.jobs.clone()).await.context("cannot submit the jobs")?;
+        if submitted.reused > 0 {
+            eprintln!("{} of {} jobs are done already", submitted.reused, submitted.jobs);
+        }
         missing = lost_results(&coordinator, &submitted.run, &store).await?;
         if missing.is_empty() && !coordinator.status(&submitted.run, 0).await?.finished {
-            if submitted.reused > 0 {
-                eprintln!("{} of {} jobs are done already", submitted.reused, submitted.jobs);
-            }
             if supervisor.is_none() {
-                let device = &args.network.device;
-                supervisor = Some(Supervisor::start(workers, &coordinator.url(), device, verbose)?);
+                let Team { workers, placement, verbose } = &team;
+                supervisor = Some(Supervisor::start(*workers, &coordinator.url(), placement, *verbose)?);
             }
             if follow(&coordinator, &submitted.run, &interrupts.drain, prepared).await? {
                 if let Some(supervisor) = supervisor.take() {

@@ -11,7 +11,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::args::{RoleArg, WorkerArgs};
 use crate::console::Outcome;
-use crate::network::backend_factory;
+use crate::network::{Placement, backend_factory, processors};
 
 /// One inference runs, the next one loads its images.
 const SLOTS: Slots = Slots { infer: 2, fuse: 2 };
@@ -36,7 +36,11 @@ pub fn run(args: WorkerArgs) -> Result<Outcome> {
         host,
         boot_id,
         role,
-        backend: backend_factory(&args.device)?,
+        backend: backend_factory(&Placement {
+            device: args.device.clone(),
+            threads: args.threads.map_or_else(processors, |threads| threads as usize),
+            memory_bytes: args.memory,
+        })?,
         device: args.device,
         slots: SLOTS,
         cache_bytes: CACHE_BYTES,

@@ -61,7 +61,7 @@ pub(crate) struct Driver {
     /// Reports whose reply is held back until there is something to say.
     parked: BTreeMap<WorkerId, Parked>,
     order: Order,
-    /// Workers that know that they are to stop.
+    /// Workers that know that they are to stop, or stop by themselves.
     told_to_stop: BTreeSet<WorkerId>,
     without_worker_since: Option<Timestamp>,
     late_results: u64,

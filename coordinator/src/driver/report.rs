@@ -42,6 +42,10 @@ impl Driver {
                 sequence: report.sequence,
             },
         );
+        if report.state == WorkerState::Drained {
+            // It goes by itself and reports no more.
+            self.told_to_stop.insert(report.worker.clone());
+        }
         let answer = match self.record(&report, now).await {
             Ok(answer) => answer,
             Err(error) => {

@@ -144,7 +144,7 @@ async fn twins_are_done_once_and_false_twins_are_refused() {
     assert_eq!((results.len(), results[0].view), (10, Some(ViewId(0))));
 
     let JobSpec::Infer(spec) = &mut jobs[3].spec else { panic!("the twin infers") };
-    spec.threads = 2;
+    spec.reference.working_width += 1;
     let error = submit_here(&handle, jobs).await.expect_err("two jobs of one id");
     assert!(error.code == Code::Invalid && error.message.contains("different contents"), "{error}");
     handle.shutdown().await;

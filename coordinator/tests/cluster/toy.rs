@@ -48,7 +48,6 @@ pub(crate) fn plan(views: u32) -> Vec<Job> {
             sources: vec![image(next(view))],
             hypotheses: DepthHypotheses::new(Sampling::Uniform, 1.0, 9.0, 64).expect("a valid range"),
             weights: BlobKey::of(b"weights"),
-            threads: 1,
         };
         jobs.push(Job { id: id("infer", view), spec: JobSpec::Infer(spec), needs: vec![] });
     }

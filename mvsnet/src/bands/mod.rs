@@ -14,6 +14,6 @@ mod volume;
 pub(crate) use halo::{rows_for_depth, rows_for_refinement};
 pub(crate) use images::{features, refined};
 pub(crate) use layers::{FeatureLayers, RegularizationLayers, refinement_layers};
-pub(crate) use predict::predict;
 pub use predict::{InferCost, InferSize};
+pub(crate) use predict::{STEP_ROWS, predict, step_rows};
 pub(crate) use volume::{Regularization, VolumeTimes};

@@ -39,6 +39,22 @@ const WARP_OPERATIONS: f64 = 32.0 * 11.0;
 /// Operations of the 3D network, for each voxel.
 const VOLUME_OPERATIONS: f64 = 20_304.0;
 
+/// Rows of the volume that are taken at a time where the memory allows it.
+pub(crate) const STEP_ROWS: usize = 8;
+
+impl InferCost {
+    /// What an inference by `CpuBackend` with this many threads, bounded by this memory, will cost.
+    pub fn predict(size: InferSize, threads: usize, memory_bytes: Option<u64>) -> Self {
+        predict(size, threads, step_rows(size, threads, memory_bytes, STEP_ROWS))
+    }
+}
+
+/// As many rows at a time as the memory allows, at most `most`, at least one.
+pub(crate) fn step_rows(size: InferSize, threads: usize, memory_bytes: Option<u64>, most: usize) -> usize {
+    let fits = |rows| memory_bytes.is_none_or(|limit| predict(size, threads, rows).bytes <= limit);
+    (1..=most).rev().find(|rows| fits(*rows)).unwrap_or(1)
+}
+
 /// The cost of an inference with all its rows, `step_rows` rows of the volume at a time.
 pub(crate) fn predict(size: InferSize, threads: usize, step_rows: usize) -> InferCost {
     let InferSize { depths, views, .. } = size;

@@ -16,7 +16,7 @@ use prost::Message;
 
 use super::check::{at_most, blob_key, each, finite, in_range, job_id, required, short};
 use crate::WireError;
-use crate::limits::{MAX_PATH_BYTES, MAX_PLANES, MAX_SIDE, MAX_SOURCES, MAX_THREADS, MAX_VIEWS};
+use crate::limits::{MAX_PATH_BYTES, MAX_PLANES, MAX_SIDE, MAX_SOURCES, MAX_VIEWS};
 use crate::wire;
 
 /// A job as bytes, for the ledger.
@@ -125,7 +125,6 @@ impl From<&InferSpec> for wire::InferSpec {
                 count: spec.hypotheses.count(),
             }),
             weights: spec.weights.0.to_vec(),
-            threads: spec.threads,
         }
     }
 }
@@ -143,7 +142,6 @@ impl TryFrom<wire::InferSpec> for InferSpec {
             sources: each(spec.sources, TryInto::try_into)?,
             hypotheses: required("hypotheses", spec.hypotheses)?.try_into()?,
             weights: blob_key("weights", &spec.weights)?,
-            threads: in_range("threads", spec.threads, 1, MAX_THREADS)?,
         })
     }
 }
@@ -387,13 +385,12 @@ mod tests {
                 let sampling = if inverse { Sampling::Inverse } else { Sampling::Uniform };
                 DepthHypotheses::new(sampling, min, min * ratio, count).expect("a valid range")
             });
-        (image(), vec(image(), 1..4), planes, any::<[u8; 32]>(), 1..=MAX_THREADS).prop_map(
-            |(reference, sources, hypotheses, weights, threads)| InferSpec {
+        (image(), vec(image(), 1..4), planes, any::<[u8; 32]>()).prop_map(
+            |(reference, sources, hypotheses, weights)| InferSpec {
                 reference,
                 sources,
                 hypotheses,
                 weights: BlobKey(weights),
-                threads,
             },
         )
     }
