@@ -321,7 +321,7 @@ pub struct DepthArgs {
     /// The folder that depth, confidence and preview go to.
     #[arg(short, long)]
     pub out: PathBuf,
-    /// Write the probability over depth at this pixel of the depth map, too.
+    /// Write the probability over depth at this pixel of the depth map too, as CSV and as a plot.
     #[arg(long, value_name = "X,Y", value_parser = parse_pixel)]
     pub probe: Option<(usize, usize)>,
     #[command(flatten)]

@@ -11,6 +11,7 @@ mod font;
 mod html;
 mod picture;
 mod preview;
+mod probability_plot;
 mod run_report;
 
 pub use cloud_picture::render_cloud;
@@ -18,4 +19,5 @@ pub use colormap::{confidence_color, depth_color};
 pub use html::{Pictures, render_html};
 pub use picture::{PictureError, encode_png};
 pub use preview::{PreviewError, PreviewOptions, draw_preview};
+pub use probability_plot::plot_probability;
 pub use run_report::{Funnel, RunReport, SkippedView, StageReport, Totals, ViewReport};

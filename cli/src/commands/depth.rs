@@ -5,6 +5,7 @@ use std::time::Instant;
 use anyhow::{Context, Result, bail};
 use planesweep_mvsnet::{CpuBackend, DepthBackend, InferInput, TorchBackend, Weights};
 use planesweep_plan::{Plan, ViewPlan, plan, working_size};
+use planesweep_report::plot_probability;
 use planesweep_scene::{DepthMap, Raster, Scene, ViewId, WorkingImage, read_image};
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -39,7 +40,7 @@ pub fn run(args: &DepthArgs) -> Result<Outcome> {
     let out = OutFolder::create(&args.out, [(view.view, name.as_str())])?;
     let everything = Raster::filled(map.width(), map.height(), true);
     let files = out.write_map(view.view, &map, &everything, &view.hypotheses)?;
-    let probed = write_probability(args, &out, view, probability.as_deref())?;
+    let probed = write_probability(args, &out, view, &map, probability.as_deref())?;
     let confident = map.confidence.values().iter().filter(|c| **c > 0.8).count();
     let share = confident as f64 / map.confidence.values().len() as f64;
     let MapFiles { depth, confidence, preview, .. } = &files;
@@ -107,20 +108,26 @@ fn working_image(scene: &Scene, plan: &Plan, id: ViewId) -> Result<WorkingImage>
         .with_context(|| format!("cannot prepare view {}", view.name))
 }
 
-/// Writes depth and probability of every plane as CSV, to be plotted like the paper's figure 3.
+/// Writes the probability over depth at the probed pixel as CSV and as a plot like the paper's figure 3.
 fn write_probability(
     args: &DepthArgs,
     out: &OutFolder,
     view: &ViewPlan,
+    map: &DepthMap,
     probability: Option<&[f32]>,
 ) -> Result<Value> {
     let (Some(probability), Some((x, y))) = (probability, args.probe) else {
         return Ok(Value::Null);
     };
+    let depths = view.hypotheses.depths();
     let mut csv = "depth,probability\n".to_owned();
-    for (depth, probability) in view.hypotheses.depths().iter().zip(probability) {
+    for (depth, probability) in depths.iter().zip(probability) {
         csv.push_str(&format!("{depth},{probability}\n"));
     }
-    let path = out.write_file(&format!("probability-{x}-{y}.csv"), csv.as_bytes())?;
-    Ok(json!(path))
+    let name = format!("probability-{x}-{y}");
+    let values = out.write_file(&format!("{name}.csv"), csv.as_bytes())?;
+    let estimate = map.depth.get(x, y).unwrap_or(0.0);
+    let svg = plot_probability(&depths, probability, f64::from(estimate));
+    let plot = out.write_file(&format!("{name}.svg"), svg.as_bytes())?;
+    Ok(json!({ "values": values, "plot": plot }))
 }
