@@ -6,7 +6,7 @@ use std::time::Instant;
 use anyhow::{Context, Result, bail};
 use bytes::Bytes;
 use planesweep_fusion::VERTEX_BYTES;
-use planesweep_plan::{BlobKey, NUMERICS_VERSION, ViewPlan};
+use planesweep_plan::{BlobKey, Job, JobId, NUMERICS_VERSION, ViewPlan};
 use planesweep_proto::{CODE_VERSION, JobResult, JobState};
 use planesweep_report::{
     Funnel, Pictures, RunReport, SkippedView, StageReport, Totals, ViewReport, encode_png, render_cloud,
@@ -30,13 +30,30 @@ use crate::run_record::{FILE_NAME, RecordedView, RunRecord};
 /// Size of the picture of the cloud in the report.
 const CLOUD_PICTURE: (u32, u32) = (1280, 960);
 
+/// Results by kind of job and view.
+type ByView<'a> = BTreeMap<(&'static str, Option<ViewId>), &'a JobResult>;
+
 /// A run whose jobs have ended.
 pub struct Finished<'a> {
-    pub args: &'a ReconstructArgs,
-    pub prepared: &'a Prepared,
-    pub store: &'a Store,
-    pub results: &'a [JobResult],
-    pub runtime: &'a Runtime,
+    args: &'a ReconstructArgs,
+    prepared: &'a Prepared,
+    store: &'a Store,
+    runtime: &'a Runtime,
+    results: &'a [JobResult],
+    by_view: ByView<'a>,
+}
+
+impl<'a> Finished<'a> {
+    /// Of the jobs' results, whose blobs are in the store.
+    pub fn new(
+        args: &'a ReconstructArgs,
+        prepared: &'a Prepared,
+        store: &'a Store,
+        runtime: &'a Runtime,
+        results: &'a [JobResult],
+    ) -> Self {
+        Self { args, prepared, store, runtime, results, by_view: by_view(&prepared.jobs, results) }
+    }
 }
 
 /// What is known of a view when its files are written.
@@ -103,8 +120,13 @@ fn own_seconds(result: &JobResult) -> f64 {
     result.measurements.get("network_seconds").copied().unwrap_or(result.seconds)
 }
 
-fn result_of<'a>(run: &'a Finished<'_>, kind: &str, view: Option<ViewId>) -> Option<&'a JobResult> {
-    run.results.iter().find(|result| result.kind == kind && result.view == view)
+/// The results by kind of job and view. They are matched by the jobs' ids, for views with the same
+/// content share their jobs.
+fn by_view<'a>(jobs: &[Job], results: &'a [JobResult]) -> ByView<'a> {
+    let by_id: BTreeMap<JobId, &JobResult> = results.iter().map(|result| (result.job, result)).collect();
+    let found =
+        jobs.iter().filter_map(|job| Some(((job.spec.kind(), job.spec.view()), *by_id.get(&job.id)?)));
+    found.collect()
 }
 
 fn blob(run: &Finished<'_>, result: &JobResult) -> Result<Option<Bytes>> {
@@ -115,20 +137,20 @@ fn blob(run: &Finished<'_>, result: &JobResult) -> Result<Option<Bytes>> {
 /// Writes depth, confidence and preview; `None` when the view's inference failed.
 fn export_view(run: &Finished<'_>, out: &OutFolder, plan: &ViewPlan) -> Result<Option<ExportedView>> {
     let view = &run.prepared.input.scene.views[&plan.view];
-    let Some(infer) = result_of(run, "infer", Some(plan.view)) else { return Ok(None) };
+    let Some(infer) = run.by_view.get(&("infer", Some(plan.view))) else { return Ok(None) };
     let Some(bytes) = blob(run, infer)? else { return Ok(None) };
     let map =
         decode_depth_map(&bytes).with_context(|| format!("cannot read the depth map of {}", view.name))?;
     let mut funnel = Funnel { pixels: map.depth.values().len() as u64, ..Funnel::default() };
     let mut kept = Raster::filled(map.width(), map.height(), false);
-    let filter = result_of(run, "filter", Some(plan.view));
+    let filter = run.by_view.get(&("filter", Some(plan.view))).copied();
     if let Some(bytes) = filter.map(|result| blob(run, result)).transpose()?.flatten() {
         let filtered =
             decode_filtered_map(&bytes).with_context(|| format!("cannot read the mask of {}", view.name))?;
         kept = filtered.depth.map(|depth| *depth > 0.0);
         (funnel.photometric, funnel.geometric) = (filtered.funnel.photometric, filtered.funnel.geometric);
     }
-    let emit = result_of(run, "emit", Some(plan.view));
+    let emit = run.by_view.get(&("emit", Some(plan.view))).copied();
     funnel.emitted = emit.and_then(|r| r.measurements.get("points")).map_or(0, |points| *points as u64);
     let files = out.write_map(plan.view, &map, &kept, &plan.hypotheses)?;
     let names =
@@ -189,7 +211,7 @@ fn write_mvsnet_side(out: &OutFolder, views: &[ExportedView]) -> Result<()> {
 }
 
 fn write_cloud(run: &Finished<'_>, out: &OutFolder) -> Result<(BlobKey, Bytes)> {
-    let assembled = result_of(run, "assemble", None).context("the ledger knows no cloud")?;
+    let assembled = *run.by_view.get(&("assemble", None)).context("the ledger knows no cloud")?;
     let Some((key, _)) = assembled.blob else {
         let (_, message) = assembled.failure.clone().unwrap_or_default();
         bail!("there is no cloud: {message}; previews of the depth maps are in {}", out.root().display());

@@ -90,9 +90,7 @@ pub fn run(args: &ReconstructArgs, json: bool, verbose: u8) -> Result<Outcome> {
         Team { workers, placement, verbose },
         &mut stages,
     ))?;
-    let finished =
-        Finished { args, prepared: &prepared, store: &store, results: &results, runtime: &runtime };
-    export::run(&finished, stages, begun)
+    export::run(&Finished::new(args, &prepared, &store, &runtime, &results), stages, begun)
 }
 
 fn timed<T>(stages: &mut Stages, name: &str, f: impl FnOnce() -> Result<T>) -> Result<T> {
