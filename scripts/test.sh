@@ -5,19 +5,21 @@
 set -uo pipefail
 cd "$(dirname "$0")/.."
 mkdir -p target
-log=target/test.log
 
 # The program itself is what several suites start.
 cargo build -p planesweep || exit 1
 if command -v cargo-nextest >/dev/null; then
-    cargo nextest run --workspace 2>&1 | tee "$log"
-    status=${PIPESTATUS[0]}
+    log=target/nextest/default/junit.xml
+    rm -f "$log"
+    cargo nextest run --workspace
+    status=$?
     # nextest runs no documentation tests.
     if [ "$status" -eq 0 ]; then
-        cargo test --workspace --doc --quiet 2>&1 | tee -a "$log"
-        status=${PIPESTATUS[0]}
+        cargo test --workspace --doc --quiet
+        status=$?
     fi
 else
+    log=target/test.log
     cargo test --workspace -- --nocapture 2>&1 | tee "$log"
     status=${PIPESTATUS[0]}
 fi

@@ -195,7 +195,7 @@ pub(crate) mod tests {
         let value: Value = serde_json::from_str(&json).expect("valid");
         assert_eq!(value["views"][0]["funnel"]["photometric"], 50_000);
         assert_eq!(value["views"][1]["sampling"], "inverse");
-        assert_eq!(value["skipped"][0]["id"], 7);
+        assert_eq!(value["skipped"][0]["name"], "lonely.jpg");
     }
 
     #[test]
