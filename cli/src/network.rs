@@ -81,7 +81,10 @@ pub fn infer_size(view: &ViewPlan) -> InferSize {
     }
 }
 
-/// As many workers as there are processors, while the memory that is available holds them.
+/// Threads that one inference on the processor keeps busy.
+const THREADS_PER_WORKER: usize = 8;
+
+/// As many workers as make the machine busy, while the memory that is available holds them.
 pub fn default_workers(plan: &Plan, device: &str) -> u32 {
     let inference_bytes = |view: &ViewPlan| {
         let size = infer_size(view);
@@ -93,7 +96,10 @@ pub fn default_workers(plan: &Plan, device: &str) -> u32 {
         }
     };
     let worker_bytes = WORKER_BYTES + plan.views.iter().map(inference_bytes).max().unwrap_or(0);
-    let most = (processors() as u64).min(plan.views.len().max(1) as u64);
+    // The kernels of our own keep several processors busy with one view and share its features; the
+    // plain network does not.
+    let threads = if device == "cpu" { THREADS_PER_WORKER } else { 1 };
+    let most = processors().div_ceil(threads).min(plan.views.len().max(1)) as u64;
     (available_bytes() / worker_bytes).clamp(1, most) as u32
 }
 
