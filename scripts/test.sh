@@ -9,7 +9,7 @@ mkdir -p target
 # The program itself is what several suites start.
 cargo build -p planesweep || exit 1
 if command -v cargo-nextest >/dev/null; then
-    log=target/nextest/default/junit.xml
+    log=${CARGO_TARGET_DIR:-target}/nextest/default/junit.xml
     rm -f "$log"
     cargo nextest run --workspace
     status=$?
