@@ -105,7 +105,7 @@ pub fn decode_funnel(bytes: &[u8]) -> Result<Funnel, BlobError> {
     reader.funnel()
 }
 
-/// The vertices in [`encode_points`]'s bytes, whole ones only.
+/// The vertices in the blob of a view's points, as the PLY file holds them; whole ones only.
 pub fn decode_points(bytes: &[u8]) -> Result<&[u8], BlobError> {
     decode_funnel(bytes)?;
     let vertices = &bytes[POINTS_HEADER_BYTES..];
