@@ -1,35 +1,40 @@
 #!/usr/bin/env bash
-# Runs all tests and then counts and names the skipped ones.
+# Runs all tests, then counts and names the skipped ones.
 #
 # A test that needs something this machine lacks prints "SKIPPED <test>: <what>" and passes.
 set -uo pipefail
 cd "$(dirname "$0")/.."
-mkdir -p target
 
 # The program itself is what several suites start.
 cargo build -p planesweep || exit 1
 if command -v cargo-nextest >/dev/null; then
-    log=${CARGO_TARGET_DIR:-target}/nextest/default/junit.xml
+    # nextest runs no documentation tests.
+    cargo test --workspace --doc --quiet || exit 1
+    log=target/nextest/default/junit.xml
     rm -f "$log"
     cargo nextest run --workspace
     status=$?
-    # nextest runs no documentation tests.
-    if [ "$status" -eq 0 ]; then
-        cargo test --workspace --doc --quiet
-        status=$?
-    fi
+    count() { grep -o "<testsuites [^>]*" "$log" | grep -o " $1=\"[0-9]*\"" | tr -dc 0-9; }
+    failed=$(($(count failures) + $(count errors)))
+    passed=$(($(count tests) - failed))
 else
+    mkdir -p target
     log=target/test.log
     cargo test --workspace -- --nocapture 2>&1 | tee "$log"
     status=${PIPESTATUS[0]}
+    count() { grep -o "test result: .*" "$log" | grep -o "[0-9]* $1" | awk '{n += $1} END {print n + 0}'; }
+    failed=$(count failed)
+    passed=$(count passed)
 fi
 
 skipped=$(grep -o 'SKIPPED .*' "$log" | sort -u)
-echo
+names=0
 if [ -n "$skipped" ]; then
-    echo "skipped tests: $(printf '%s\n' "$skipped" | wc -l)"
-    printf '  %s\n' "$skipped" | sed 's/SKIPPED //'
-else
-    echo "skipped tests: 0"
+    names=$(printf '%s\n' "$skipped" | cut -d: -f1 | sort -u | wc -l)
+    echo
+    echo "skipped for want of data or tools:"
+    printf '%s\n' "$skipped" | sed 's/SKIPPED /  /'
 fi
+echo
+echo "$((passed - names)) passed, $failed failed, $names skipped"
 exit "$status"
