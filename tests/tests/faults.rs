@@ -70,7 +70,7 @@ fn a_killed_worker_is_replaced_and_its_job_done_again() {
 }
 
 #[test]
-fn a_frozen_worker_is_done_without_and_its_late_result_refused() {
+fn a_frozen_worker_is_done_without_and_changes_no_byte() {
     let bench = of_courtyard();
     let _ = bench.reconstruct("calm", &COURTYARD).expect_code(0);
 
