@@ -25,6 +25,7 @@ mod pfm;
 mod raster;
 mod read;
 mod scene;
+mod training_sample;
 mod working_image;
 mod write;
 
@@ -40,6 +41,7 @@ pub use read::{
     resolve_inside, safe_name,
 };
 pub use scene::{DepthRange, Scene, SourceScore, SparsePoints, View};
+pub use training_sample::TrainingSample;
 pub use working_image::{PrepareError, WorkingImage};
 pub use write::{
     WriteError, mvsnet_cam_text, mvsnet_pair_text, write_atomically, write_colmap, write_mvsnet,

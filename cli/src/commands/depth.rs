@@ -1,8 +1,10 @@
 //! `planesweep depth`: one view, in this process, without a coordinator.
 
+use std::path::PathBuf;
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
+use clap::Args;
 use planesweep_mvsnet::{CpuBackend, DepthBackend, InferInput, TorchBackend, Weights};
 use planesweep_plan::{Plan, ViewPlan, plan, working_size};
 use planesweep_report::plot_probability;
@@ -10,11 +12,35 @@ use planesweep_scene::{DepthMap, Raster, Scene, ViewId, WorkingImage, read_image
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use crate::args::{DepthArgs, NetworkArgs};
+use crate::args::values::pixel;
+use crate::args::{NetworkArgs, PlanArgs, ReadArgs};
 use crate::console::Outcome;
 use crate::input;
 use crate::network::{processors, read_weights};
 use crate::out_folder::{MapFiles, OutFolder};
+
+/// Arguments of `depth`.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: planesweep depth my-colmap-project --view DSC_0001.JPG -o one-view")]
+pub struct DepthArgs {
+    /// The scene.
+    pub scene: PathBuf,
+    /// The view, by name or id.
+    #[arg(long)]
+    pub view: String,
+    /// The folder that depth, confidence and preview go to.
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// Write the probability over depth at this pixel of the depth map too, as CSV and as a plot.
+    #[arg(long, value_name = "X,Y", value_parser = pixel)]
+    pub probe: Option<(usize, usize)>,
+    #[command(flatten)]
+    pub network: NetworkArgs,
+    #[command(flatten)]
+    pub plan: PlanArgs,
+    #[command(flatten)]
+    pub read: ReadArgs,
+}
 
 /// Infers and writes one depth map.
 pub fn run(args: &DepthArgs) -> Result<Outcome> {

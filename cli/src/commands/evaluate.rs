@@ -3,14 +3,31 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
+use clap::{Args, Subcommand};
 use planesweep_evaluate::{DepthErrorOptions, DepthErrors, ErrorSummary, depth_error, truth_at_estimate};
 use planesweep_scene::{read_depth_pfm, read_pfm};
 use rayon::prelude::*;
 use serde_json::json;
 
-use crate::args::{EvaluateCommand, EvaluateDepthArgs};
 use crate::console::{Outcome, table};
 use crate::run_record::{RecordedView, RunRecord};
+
+/// The evaluate commands.
+#[derive(Debug, Subcommand)]
+pub enum EvaluateCommand {
+    /// Compare the depth maps of a result with true ones.
+    Depth(EvaluateDepthArgs),
+}
+
+/// Arguments of `evaluate depth`.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: planesweep evaluate depth demo/out demo/scene/depth_gt")]
+pub struct EvaluateDepthArgs {
+    /// A folder that `reconstruct` made.
+    pub out: PathBuf,
+    /// The folder with the true depth of each view: NAME.pfm.
+    pub truth: PathBuf,
+}
 
 /// Measures.
 pub fn run(command: &EvaluateCommand) -> Result<Outcome> {

@@ -20,8 +20,8 @@ use rayon::prelude::*;
 use serde_json::json;
 use tokio::runtime::Runtime;
 
+use super::reconstruct::ReconstructArgs;
 use super::reconstruct::{Prepared, Stages};
-use crate::args::ReconstructArgs;
 use crate::console::Outcome;
 use crate::input::{Skipped, all_skipped};
 use crate::out_folder::{OutFolder, depth_range, trajectory};

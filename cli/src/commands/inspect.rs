@@ -1,15 +1,32 @@
 //! `planesweep inspect`.
 
+use std::path::PathBuf;
+
 use anyhow::Result;
+use clap::Args;
 use planesweep_mvsnet::InferCost;
 use planesweep_plan::{Plan, RangeOrigin, ViewPlan, plan};
 use planesweep_scene::{Distortion, Sampling, Scene};
 use serde_json::json;
 
-use crate::args::InspectArgs;
+use crate::args::{FilterArgs, PlanArgs, ReadArgs};
 use crate::console::{Outcome, table};
 use crate::input::{self, all_skipped};
 use crate::network::infer_size;
+
+/// Arguments of `inspect`.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: planesweep inspect my-colmap-project --max-size 1152")]
+pub struct InspectArgs {
+    /// The scene.
+    pub scene: PathBuf,
+    #[command(flatten)]
+    pub plan: PlanArgs,
+    #[command(flatten)]
+    pub filter: FilterArgs,
+    #[command(flatten)]
+    pub read: ReadArgs,
+}
 
 /// Says what would be done.
 pub fn run(args: &InspectArgs) -> Result<Outcome> {

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, anyhow, bail};
+use clap::Args;
 use planesweep_coordinator::{Config, Coordinator, Handle};
 use planesweep_mvsnet::Weights;
 use planesweep_plan::{BlobKey, Job, JobId, Plan, RunId, jobs, plan};
@@ -13,11 +14,42 @@ use planesweep_worker::Store;
 use tokio_util::sync::CancellationToken;
 
 use super::export::{self, Finished};
-use crate::args::ReconstructArgs;
+use crate::args::{FilterArgs, NetworkArgs, PlanArgs, ReadArgs};
 use crate::console::{Outcome, Progress};
 use crate::input::{self, Input};
 use crate::network::{Placement, backend_factory, default_workers, processors, read_weights, weights_for};
 use crate::supervisor::Supervisor;
+
+/// Arguments of `reconstruct`.
+#[derive(Debug, Args)]
+#[command(
+    after_help = "SCENE is a COLMAP project (images/ and sparse/ or sparse/0/) or an MVSNet folder (images/ \
+    and cams/).\nExample: planesweep reconstruct my-colmap-project -o out --max-size 1152"
+)]
+pub struct ReconstructArgs {
+    /// The scene.
+    pub scene: PathBuf,
+    /// Where the result goes; an interrupted run in the same folder is resumed.
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// Worker processes; by default as many as make the machine busy and fit into its memory.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub workers: Option<u32>,
+    /// Threads of each worker's inference; by default the processors are shared evenly.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
+    /// Forget what an earlier run in the same folder has done.
+    #[arg(long)]
+    pub fresh: bool,
+    #[command(flatten)]
+    pub network: NetworkArgs,
+    #[command(flatten)]
+    pub plan: PlanArgs,
+    #[command(flatten)]
+    pub filter: FilterArgs,
+    #[command(flatten)]
+    pub read: ReadArgs,
+}
 
 /// How often progress is asked for.
 const POLL: Duration = Duration::from_millis(200);

@@ -1,16 +1,60 @@
 //! `planesweep weights import` and `planesweep weights inspect`.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
+use clap::{Args, Subcommand, ValueEnum};
 use planesweep_mvsnet::{CostMetric, ImportOptions, Normalization, Weights};
 use planesweep_plan::BlobKey;
 use planesweep_scene::write_atomically;
 use serde_json::json;
 
-use crate::args::{ImportArgs, NormalizationArg, WeightsCommand};
 use crate::console::Outcome;
 use crate::network::read_weights;
+
+/// The weights commands.
+#[derive(Debug, Subcommand)]
+pub enum WeightsCommand {
+    /// Turn a checkpoint of the public PyTorch MVSNet into safetensors; no code in it is ever run.
+    Import(ImportArgs),
+    /// Say what a weights file holds.
+    Inspect {
+        /// The file.
+        file: PathBuf,
+    },
+}
+
+/// Arguments of `weights import`.
+#[derive(Debug, Args)]
+#[command(
+    after_help = "Example: planesweep weights import model_000014.ckpt -o mvsnet.safetensors --licence unknown"
+)]
+pub struct ImportArgs {
+    /// The checkpoint.
+    pub checkpoint: PathBuf,
+    /// The file to write.
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// How images were normalised in training: unit (0..1 RGB, as the public port does) or
+    /// per-image (zero mean, unit variance).
+    #[arg(long, value_enum, default_value = "unit")]
+    pub normalization: NormalizationArg,
+    /// Where the weights come from; by default the checkpoint's file name.
+    #[arg(long)]
+    pub source: Option<String>,
+    /// Their licence.
+    #[arg(long, default_value = "unknown")]
+    pub licence: String,
+}
+
+/// How images become input, on the command line.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum NormalizationArg {
+    /// RGB from 0 to 1.
+    Unit,
+    /// Zero mean and unit variance of each channel of each image.
+    PerImage,
+}
 
 /// Imports or inspects.
 pub fn run(command: &WeightsCommand) -> Result<Outcome> {

@@ -3,15 +3,54 @@
 use std::io::Read;
 
 use anyhow::{Context, Result};
+use clap::{Args, ValueEnum};
 use planesweep_plan::WorkerId;
 use planesweep_proto::{Role, Slots};
 use planesweep_worker::{WorkerConfig, run_worker};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
-use crate::args::{RoleArg, WorkerArgs};
+use crate::args::values::bytes;
 use crate::console::Outcome;
 use crate::network::{Placement, backend_factory, processors};
+
+/// Arguments of `worker`.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: planesweep worker --coordinator http://10.0.0.1:7070 --role both")]
+pub struct WorkerArgs {
+    /// The coordinator's address.
+    #[arg(long, env = "PLANESWEEP_COORDINATOR")]
+    pub coordinator: String,
+    /// The token that the coordinator wants.
+    #[arg(long, env = "PLANESWEEP_TOKEN", hide_env_values = true)]
+    pub token: Option<String>,
+    /// Which jobs it takes.
+    #[arg(long, value_enum, default_value = "both")]
+    pub role: RoleArg,
+    /// Where to infer: cpu, torch, cuda or cuda:N; `analytic` is a test double that knows a plane.
+    #[arg(long, default_value = "cpu")]
+    pub device: String,
+    /// Threads of an inference; by default all processors.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
+    /// Memory for inference, such as 800M or 2G.
+    #[arg(long, value_name = "SIZE", value_parser = bytes)]
+    pub memory: Option<u64>,
+    /// Stop when standard input ends, that is, when the process that started this one is gone.
+    #[arg(long, hide = true)]
+    pub stop_with_stdin: bool,
+}
+
+/// Which jobs a worker takes, on the command line.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum RoleArg {
+    /// Inference only.
+    Infer,
+    /// Everything but inference.
+    Fuse,
+    /// Every job.
+    Both,
+}
 
 /// One inference runs, the next one loads its images.
 const SLOTS: Slots = Slots { infer: 2, fuse: 2 };

@@ -1,0 +1,101 @@
+//! The command line: what several commands share; the arguments of one command stand with it.
+
+mod fusion;
+mod inference;
+mod scene;
+pub mod values;
+
+use clap::{Parser, Subcommand};
+
+pub use self::fusion::FilterArgs;
+pub use self::inference::{NetworkArgs, PlanArgs};
+pub use self::scene::ReadArgs;
+use crate::commands::depth::DepthArgs;
+use crate::commands::evaluate::EvaluateCommand;
+use crate::commands::inspect::InspectArgs;
+use crate::commands::reconstruct::ReconstructArgs;
+use crate::commands::synth::SynthArgs;
+use crate::commands::weights::WeightsCommand;
+use crate::commands::worker::WorkerArgs;
+
+/// Dense multi-view stereo: photographs with known cameras in, one dense, coloured point cloud out.
+#[derive(Debug, Parser)]
+#[command(
+    name = "planesweep",
+    version,
+    after_help = "Exit codes: 0 done, 1 failed, 2 usage, 3 done with skipped views.\n\
+                  Example: planesweep reconstruct my-colmap-project -o out --max-size 1152"
+)]
+pub struct Cli {
+    /// Print one JSON object on stdout instead of text.
+    #[arg(long, global = true)]
+    pub json: bool,
+    /// Log more on stderr; twice for even more.
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    pub verbose: u8,
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// The commands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Turn a scene into depth maps and a point cloud, on this host; resumes by itself.
+    Reconstruct(ReconstructArgs),
+    /// Say what would be done with a scene, and what is odd about it.
+    Inspect(InspectArgs),
+    /// Infer the depth map of one view in this process.
+    Depth(DepthArgs),
+    /// Make a scene with exact ground truth.
+    Synth(SynthArgs),
+    /// Import or inspect weights of the network.
+    #[command(subcommand)]
+    Weights(WeightsCommand),
+    /// Measure how good a result is.
+    #[command(subcommand)]
+    Evaluate(EvaluateCommand),
+    /// Work for a coordinator until it says stop.
+    Worker(WorkerArgs),
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn a_quality_is_a_set_of_defaults() {
+        let plan = |args: &[&str]| {
+            let command = ["planesweep", "inspect", "scene"].iter().chain(args);
+            match Cli::try_parse_from(command).expect("valid").command {
+                Command::Inspect(args) => args.plan.options(None),
+                other => panic!("parsed as {other:?}"),
+            }
+        };
+        let paper = plan(&["--quality", "paper", "--depths", "64"]);
+        assert_eq!((paper.max_size, paper.views, paper.depths), (Some(1920), 5, Some(64)));
+        assert_eq!(plan(&["--depth-range", "1,9.5"]).depth_range, Some((1.0, 9.5)));
+        assert_eq!(plan(&[]).max_size, Some(1600));
+    }
+
+    #[test]
+    fn senseless_numbers_are_usage_errors() {
+        let refused = |option: &str, value: &str| {
+            let option = format!("{option}={value}");
+            let args = ["planesweep", "reconstruct", "s", "-o", "o", "--weights", "w", &option];
+            Cli::try_parse_from(args).is_err()
+        };
+        assert!(refused("--depth-range", "9,1") && refused("--depth-range", "0,1"));
+        assert!(refused("--min-views", "0") && refused("--min-confidence", "nan"));
+        assert!(refused("--max-reprojection", "-1") && refused("--max-depth-difference", "inf"));
+        assert!(!refused("--min-confidence", "0.5"));
+        assert!(refused("--memory", "2X"));
+    }
+}

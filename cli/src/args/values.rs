@@ -1,0 +1,68 @@
+//! Values that clap does not know: sizes, shares, ranges, pixels.
+
+/// A number from 0 to 1.
+pub fn share(text: &str) -> Result<f32, String> {
+    let value: f32 = text.parse().map_err(|_| format!("{text} is not a number"))?;
+    if (0.0..=1.0).contains(&value) { Ok(value) } else { Err(format!("{text} is not from 0 to 1")) }
+}
+
+/// A positive, finite number.
+pub fn positive(text: &str) -> Result<f32, String> {
+    let value: f32 = text.parse().map_err(|_| format!("{text} is not a number"))?;
+    if value > 0.0 && value.is_finite() { Ok(value) } else { Err(format!("{text} is not positive")) }
+}
+
+/// Two depths, `NEAR,FAR`.
+pub fn depth_range(text: &str) -> Result<(f64, f64), String> {
+    let number = |text: &str| text.trim().parse::<f64>().map_err(|_| format!("{text} is not a number"));
+    let (near, far) = text.split_once(',').ok_or("two depths are needed: NEAR,FAR")?;
+    let (near, far) = (number(near)?, number(far)?);
+    if near > 0.0 && far > near && far.is_finite() {
+        Ok((near, far))
+    } else {
+        Err(format!("{near} to {far} is not positive and increasing"))
+    }
+}
+
+/// A size in bytes: a number with K, M, G or T (powers of 1024) behind it or without.
+pub fn bytes(text: &str) -> Result<u64, String> {
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let shift = match text[digits.len()..].trim_end_matches(['B', 'b', 'i']).to_ascii_uppercase().as_str() {
+        "" => 0,
+        "K" => 10,
+        "M" => 20,
+        "G" => 30,
+        "T" => 40,
+        _ => return Err(format!("{text} is no size; write it like 800M or 2G")),
+    };
+    let number: f64 = digits.parse().map_err(|_| format!("{text} is no size; write it like 800M or 2G"))?;
+    let size = number * (1_u64 << shift) as f64;
+    if (1.0..1e18).contains(&size) { Ok(size as u64) } else { Err(format!("{text} is no size")) }
+}
+
+/// A pixel, column and row, as "X,Y".
+pub fn pixel(text: &str) -> Result<(usize, usize), String> {
+    let number = |text: &str| text.trim().parse().ok();
+    let pixel = text.split_once(',').and_then(|(x, y)| Some((number(x)?, number(y)?)));
+    pixel.ok_or_else(|| "a pixel is two numbers with a comma between, such as 12,34".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_have_units() {
+        assert_eq!(bytes("1.5G"), Ok(3 << 29));
+        assert_eq!(bytes("800MiB"), Ok(800 << 20));
+        assert!(bytes("2X").is_err() && bytes("-1G").is_err());
+    }
+
+    #[test]
+    fn a_pixel_is_two_numbers() {
+        assert_eq!(pixel("12,34"), Ok((12, 34)));
+        for wrong in ["12", "12,", "1,2,3", "-1,2"] {
+            assert!(pixel(wrong).is_err(), "{wrong}");
+        }
+    }
+}
