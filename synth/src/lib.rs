@@ -16,6 +16,8 @@ mod scene;
 mod shade;
 mod sparse;
 mod texture;
+mod training;
 
 pub use demo::{DemoError, DemoOptions, write_demo};
 pub use scene::{Style, SynthScene};
+pub use training::{Setting, TrainingOptions, training_sample};

@@ -81,7 +81,7 @@ pub fn encode(linear: f32) -> u8 {
 }
 
 /// A point of the unit disc across `axis`.
-fn disc(axis: &Vector3<f64>, u: f64, v: f64) -> Vector3<f64> {
+pub fn disc(axis: &Vector3<f64>, u: f64, v: f64) -> Vector3<f64> {
     let side = if axis.x.abs() < 0.8 { Vector3::x() } else { Vector3::y() };
     let a = axis.cross(&side).normalize();
     let b = axis.cross(&a);

@@ -70,7 +70,8 @@ impl Material {
         base.map(|c| (c * factor).clamp(0.01, 0.95))
     }
 
-    fn pattern_color(&self, spot: &Spot) -> Rgb {
+    /// The pattern without grain.
+    pub fn pattern_color(&self, spot: &Spot) -> Rgb {
         let [first, second, third] = self.palette;
         let [u, v] = spot.along.map(|c| c / self.scale);
         let solid = spot.local.map(|c| c / self.scale);

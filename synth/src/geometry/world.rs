@@ -51,6 +51,8 @@ impl Body {
 pub struct Hit {
     /// The index of the body.
     pub body: usize,
+    /// The ray's `t`.
+    pub t: f64,
     /// Where in the world.
     pub point: Point3<f64>,
     /// The outward normal in the world, of length 1.
@@ -98,7 +100,7 @@ impl World {
         let local = body.placement.point_to_local(&point);
         let normal = body.shape.normal(&local);
         let along = body.shape.surface_coordinates(&local, &normal);
-        Some(Hit { body: index, point, normal: body.placement.rotation * normal, local, along })
+        Some(Hit { body: index, t, point, normal: body.placement.rotation * normal, local, along })
     }
 
     /// Whether anything lies on the ray between 0 and `max`.
