@@ -1,5 +1,7 @@
 //! What every implementation of the network offers.
 
+use std::ops::Range;
+
 use planesweep_scene::{Camera, DepthHypotheses, DepthMap, Raster, WorkingImage};
 use thiserror::Error;
 
@@ -72,6 +74,23 @@ pub trait DepthBackend {
     /// Infers depth and confidence at a quarter of the reference image's size (rounded up), with the
     /// colours of the reference image sampled there.
     fn infer(&mut self, input: InferInput<'_>) -> Result<DepthMap, InferError>;
+
+    /// Infers only some rows of the depth map: the same values as [`DepthBackend::infer`] gives there, bit for
+    /// bit, with the camera of those rows. A backend that knows no bands infers all of it.
+    fn infer_rows(&mut self, input: InferInput<'_>, rows: Range<usize>) -> Result<DepthMap, InferError> {
+        check_rows(input, &rows)?;
+        Ok(self.infer(input)?.rows(&rows))
+    }
+}
+
+/// Refuses rows that the depth map of the reference does not have.
+pub(crate) fn check_rows(input: InferInput<'_>, rows: &Range<usize>) -> Result<(), InferError> {
+    let pixels = &input.reference.pixels;
+    let (width, height) = (pixels.width().div_ceil(4), pixels.height().div_ceil(4));
+    if rows.start < rows.end && rows.end <= height {
+        return Ok(());
+    }
+    Err(InferError::PixelOutside { x: 0, y: rows.end.max(1) - 1, width, height })
 }
 
 /// The camera of an image's depth map, whose pixel `u` is centred on image pixel `4u`.

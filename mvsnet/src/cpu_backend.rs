@@ -4,11 +4,11 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use planesweep_scene::{Camera, DepthMap, Raster, WorkingImage};
+use planesweep_scene::{DepthMap, Raster, WorkingImage};
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 use thiserror::Error;
 
-use crate::backend::{quarter, quarter_camera};
+use crate::backend::{check_rows, quarter, quarter_camera};
 use crate::bands::{
     FeatureLayers, InferCost, InferSize, Regularization, RegularizationLayers, STEP_ROWS, VolumeTimes,
     features, predict, refined, refinement_layers, rows_for_depth, rows_for_refinement, step_rows,
@@ -134,18 +134,6 @@ impl CpuBackend {
     /// Where the time of the last inference went.
     pub fn times(&self) -> InferTimes {
         self.times
-    }
-
-    /// Infers only some rows of the depth map: the same values as [`DepthBackend::infer`] gives there, bit for
-    /// bit. The result is a depth map of those rows, with their camera.
-    pub fn infer_rows(&mut self, input: InferInput<'_>, rows: Range<usize>) -> Result<DepthMap, InferError> {
-        let (camera, color) = quarter(input.reference);
-        let (width, height) = (color.width(), color.height());
-        if rows.start >= rows.end || rows.end > height {
-            return Err(InferError::PixelOutside { x: 0, y: rows.end.max(1) - 1, width, height });
-        }
-        let maps = self.run(input, &rows)?;
-        Ok(maps.cropped(&rows, camera, &color))
     }
 
     /// The probability of each hypothesis, nearest first, at a pixel of the depth map (paper figure 3c).
@@ -292,22 +280,6 @@ struct Maps {
     confidence: Vec<f32>,
 }
 
-impl Maps {
-    /// The rows of a depth map whose whole has this camera and these colours.
-    fn cropped(&self, rows: &Range<usize>, mut camera: Camera, color: &Raster<[u8; 3]>) -> DepthMap {
-        let width = color.width();
-        let cropped = |values: &[f32]| {
-            let padded = values.len() / rows.len();
-            Raster::from_fn(width, rows.len(), |x, y| values[y * padded + x])
-        };
-        let color = Raster::from_fn(width, rows.len(), |x, y| color.at(x, rows.start + y));
-        camera.intrinsics.height = rows.len() as u32;
-        camera.intrinsics.cy -= rows.start as f64;
-        let map = DepthMap::new(camera, cropped(&self.depth), cropped(&self.confidence), color);
-        map.expect("all parts have the size of the rows")
-    }
-}
-
 impl DepthBackend for CpuBackend {
     fn info(&self) -> BackendInfo {
         BackendInfo { name: "bands".to_owned(), device: "cpu".to_owned() }
@@ -316,6 +288,19 @@ impl DepthBackend for CpuBackend {
     fn infer(&mut self, input: InferInput<'_>) -> Result<DepthMap, InferError> {
         let height = input.reference.pixels.height().div_ceil(4);
         self.infer_rows(input, 0..height)
+    }
+
+    fn infer_rows(&mut self, input: InferInput<'_>, rows: Range<usize>) -> Result<DepthMap, InferError> {
+        check_rows(input, &rows)?;
+        let (camera, color) = quarter(input.reference);
+        let width = color.width();
+        let Maps { depth, confidence } = self.run(input, &rows)?;
+        // What is inferred is padded, and of the wanted rows only.
+        let padded = depth.len() / rows.len();
+        let cropped = |values: &[f32]| Raster::from_fn(width, rows.len(), |x, y| values[y * padded + x]);
+        let color = Raster::from_fn(width, rows.len(), |x, y| color.at(x, rows.start + y));
+        let map = DepthMap::new(camera.rows(&rows), cropped(&depth), cropped(&confidence), color);
+        Ok(map.expect("all parts have the size of the rows"))
     }
 }
 

@@ -1,5 +1,6 @@
 //! Jobs: what a worker is handed, complete, so that nothing is left to decide when it is carried out.
 
+use std::ops::Range;
 use std::path::PathBuf;
 
 use planesweep_fusion::FilterOptions;
@@ -26,8 +27,10 @@ pub struct Job {
 #[derive(Clone, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "a third of all jobs are the large variant")]
 pub enum JobSpec {
-    /// Infers the depth map of a view.
+    /// Infers the depth map of a view, or a band of its rows.
     Infer(InferSpec),
+    /// Puts the bands of a view's depth map together.
+    Stitch(StitchSpec),
     /// Filters the depth map of a view against those of its neighbours and merges agreeing depths.
     Filter(FilterSpec),
     /// Turns the filtered depth map of a view into points.
@@ -36,7 +39,7 @@ pub enum JobSpec {
     Assemble(AssembleSpec),
 }
 
-/// Inference of one view. Needs nothing.
+/// Inference of one view or of a band of it. Needs nothing.
 #[derive(Clone, Debug, PartialEq)]
 pub struct InferSpec {
     /// The reference image.
@@ -45,8 +48,17 @@ pub struct InferSpec {
     pub sources: Vec<ImageSpec>,
     /// The depth planes of the reference camera.
     pub hypotheses: DepthHypotheses,
+    /// The rows of the depth map that are wanted; all without.
+    pub rows: Option<Range<u32>>,
     /// The weights file in the store.
     pub weights: BlobKey,
+}
+
+/// The depth map of a view that is inferred in bands. Needs the `Infer` jobs of all bands, from the top.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StitchSpec {
+    /// The reference view.
+    pub view: ViewId,
 }
 
 /// An image as the network wants it: undistorted, then resized to the working size.
@@ -70,7 +82,8 @@ pub struct ImageSpec {
     pub working_height: u32,
 }
 
-/// Filtering of one view. Needs the `Infer` jobs of the view, first, and of its neighbours, in order.
+/// Filtering of one view. Needs the jobs that give the depth maps (`Infer`, or `Stitch` where there
+/// are bands) of the view, first, and of its neighbours, in order.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FilterSpec {
     /// The reference view.
@@ -98,10 +111,11 @@ pub struct AssembleSpec {
 }
 
 impl JobSpec {
-    /// The name of the kind: "infer", "filter", "emit" or "assemble".
+    /// The name of the kind: "infer", "stitch", "filter", "emit" or "assemble".
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Infer(_) => "infer",
+            Self::Stitch(_) => "stitch",
             Self::Filter(_) => "filter",
             Self::Emit(_) => "emit",
             Self::Assemble(_) => "assemble",
@@ -112,6 +126,7 @@ impl JobSpec {
     pub fn view(&self) -> Option<ViewId> {
         match self {
             Self::Infer(spec) => Some(spec.reference.view),
+            Self::Stitch(spec) => Some(spec.view),
             Self::Filter(spec) => Some(spec.view),
             Self::Emit(spec) => Some(spec.view),
             Self::Assemble(_) => None,

@@ -6,7 +6,9 @@ use planesweep_fusion::DepthSampling;
 use planesweep_scene::{Camera, DepthHypotheses, Distortion, Sampling, Scene, ViewId};
 use thiserror::Error;
 
-use crate::job::{AssembleSpec, EmitSpec, FilterSpec, ImageSpec, InferSpec, Job, JobSpec, NUMERICS_VERSION};
+use crate::job::{
+    AssembleSpec, EmitSpec, FilterSpec, ImageSpec, InferSpec, Job, JobSpec, NUMERICS_VERSION, StitchSpec,
+};
 use crate::size::working_size;
 use crate::{BlobKey, JobId, Plan};
 
@@ -22,7 +24,7 @@ pub enum JobsError {
 }
 
 /// The jobs of a plan, every job after the jobs it needs: all `Infer` jobs in the order of the plan,
-/// then all `Filter`, all `Emit`, and `Assemble`.
+/// then all `Stitch`, all `Filter`, all `Emit`, and `Assemble`.
 ///
 /// `image_hashes` are the hashes of the image files' bytes; `weights` is the key of the weights.
 pub fn jobs(
@@ -50,38 +52,54 @@ pub fn jobs(
         })
     };
     let mut infer = Vec::with_capacity(plan.views.len());
+    let mut stitch = Vec::new();
+    // Who gives the depth map of each view.
+    let mut maps = BTreeMap::new();
     for view in &plan.views {
-        let spec = InferSpec {
+        let whole = InferSpec {
             reference: image(view.view)?,
             sources: view.sources.iter().map(|source| image(*source)).collect::<Result<_, _>>()?,
             hypotheses: view.hypotheses,
+            rows: None,
             weights,
         };
-        infer.push(job(JobSpec::Infer(spec), Vec::new()));
+        if view.bands.is_empty() {
+            let map = job(JobSpec::Infer(whole), Vec::new());
+            maps.insert(view.view, map.id);
+            infer.push(map);
+            continue;
+        }
+        let bands = view.bands.iter().map(|rows| InferSpec { rows: Some(rows.clone()), ..whole.clone() });
+        let bands: Vec<Job> = bands.map(|band| job(JobSpec::Infer(band), Vec::new())).collect();
+        let needs = bands.iter().map(|band| band.id).collect();
+        let whole = job(JobSpec::Stitch(StitchSpec { view: view.view }), needs);
+        maps.insert(view.view, whole.id);
+        infer.extend(bands);
+        stitch.push(whole);
     }
-    let by_neighbourhood = |previous: &[Job], spec: &dyn Fn(ViewId, Vec<ViewId>) -> JobSpec| -> Vec<Job> {
-        let ids: BTreeMap<ViewId, JobId> =
-            previous.iter().filter_map(|job| Some((job.spec.view()?, job.id))).collect();
-        let of_view = plan.views.iter().map(|view| {
-            let neighbours: Vec<ViewId> =
-                view.neighbours.iter().copied().filter(|n| ids.contains_key(n)).collect();
-            let needs = std::iter::once(&view.view).chain(&neighbours).map(|view| ids[view]).collect();
-            job(spec(view.view, neighbours), needs)
-        });
-        of_view.collect()
-    };
+    let by_neighbourhood =
+        |ids: &BTreeMap<ViewId, JobId>, spec: &dyn Fn(ViewId, Vec<ViewId>) -> JobSpec| -> Vec<Job> {
+            let of_view = plan.views.iter().map(|view| {
+                let neighbours: Vec<ViewId> =
+                    view.neighbours.iter().copied().filter(|n| ids.contains_key(n)).collect();
+                let needs = std::iter::once(&view.view).chain(&neighbours).map(|view| ids[view]).collect();
+                job(spec(view.view, neighbours), needs)
+            });
+            of_view.collect()
+        };
     let options = plan.options.filter;
-    let filter = by_neighbourhood(&infer, &|view, neighbours| {
+    let filter = by_neighbourhood(&maps, &|view, neighbours| {
         JobSpec::Filter(FilterSpec { view, neighbours, options })
     });
-    let emit = by_neighbourhood(&filter, &|view, neighbours| JobSpec::Emit(EmitSpec { view, neighbours }));
+    let filtered = filter.iter().filter_map(|job| Some((job.spec.view()?, job.id))).collect();
+    let emit = by_neighbourhood(&filtered, &|view, neighbours| JobSpec::Emit(EmitSpec { view, neighbours }));
     // The cloud is in the order of view ids, which does not change when the plan's order does.
     let mut emitted: Vec<(ViewId, JobId)> =
         emit.iter().filter_map(|job| Some((job.spec.view()?, job.id))).collect();
     emitted.sort_unstable();
     let (views, needs) = emitted.into_iter().unzip();
     let assemble = job(JobSpec::Assemble(AssembleSpec { views }), needs);
-    Ok(infer.into_iter().chain(filter).chain(emit).chain([assemble]).collect())
+    Ok(infer.into_iter().chain(stitch).chain(filter).chain(emit).chain([assemble]).collect())
 }
 
 /// Names a job by the hash of its specification, of the jobs it needs and of the code's numerics.
@@ -99,6 +117,9 @@ fn job(spec: JobSpec, needs: Vec<JobId>) -> Job {
             }
             digest.hypotheses(&infer.hypotheses);
             digest.bytes(&infer.weights.0);
+            for row in infer.rows.iter().flat_map(|rows| [rows.start, rows.end]) {
+                digest.u32(row);
+            }
         }
         JobSpec::Filter(filter) => {
             let options = filter.options;
@@ -111,7 +132,7 @@ fn job(spec: JobSpec, needs: Vec<JobId>) -> Job {
                 DepthSampling::Continuous => 1,
             });
         }
-        JobSpec::Emit(_) | JobSpec::Assemble(_) => {}
+        JobSpec::Stitch(_) | JobSpec::Emit(_) | JobSpec::Assemble(_) => {}
     }
     digest.u32(needs.len() as u32);
     for need in &needs {
@@ -249,6 +270,38 @@ mod tests {
         let mut bent = scene();
         bent.views.get_mut(&ViewId(0)).expect("exists").distortion = Distortion::Radial { k1: 0.1, k2: 0.0 };
         assert!(ids(&plain).is_disjoint(&ids(&jobs_of(&bent, &PlanOptions::default(), b"w"))));
+    }
+
+    #[test]
+    fn a_view_in_bands_is_stitched_before_it_is_filtered() {
+        let mut scene = scene();
+        for view in scene.views.values_mut() {
+            view.camera.intrinsics = Intrinsics { height: 150, cy: 74.5, ..view.camera.intrinsics };
+        }
+        let options = PlanOptions { band_rows: Some(32), ..PlanOptions::default() };
+        let banded = jobs_of(&scene, &options, b"w");
+        let kinds = |kind: &str| banded.iter().filter(|job| job.spec.kind() == kind).count();
+        // 38 rows of the depth map: 8, 8, 8 and the rest.
+        assert_eq!(["infer", "stitch", "filter", "emit", "assemble"].map(kinds), [16, 4, 4, 4, 1]);
+        let mut done = BTreeSet::new();
+        for job in &banded {
+            assert!(job.needs.iter().all(|need| done.contains(need)), "{}", job.spec.kind());
+            assert!(done.insert(job.id), "two jobs have the same id");
+        }
+        let rows = |job: &JobId| {
+            banded.iter().find_map(|other| match &other.spec {
+                JobSpec::Infer(spec) if other.id == *job => spec.rows.clone(),
+                _ => None,
+            })
+        };
+        assert_eq!(
+            banded[16].needs.iter().filter_map(rows).collect::<Vec<_>>(),
+            [0..8, 8..16, 16..24, 24..38]
+        );
+        let stitched: BTreeSet<JobId> = banded[16..20].iter().map(|job| job.id).collect();
+        assert!(banded[20].needs.iter().all(|need| stitched.contains(need)));
+        let whole = jobs_of(&scene, &PlanOptions::default(), b"w");
+        assert!(ids(&banded).is_disjoint(&ids(&whole)));
     }
 
     #[test]

@@ -8,6 +8,7 @@
 //! plan, and the same plan the same job ids, so that work already done is recognised.
 #![warn(missing_docs)]
 
+mod bands;
 mod depth_range;
 mod ids;
 mod job;
@@ -20,7 +21,9 @@ mod views;
 
 pub use depth_range::{DEPTH_MULTIPLE, MIN_POINTS};
 pub use ids::{Attempt, BlobKey, JobId, ParseHashError, RunId, WorkerId};
-pub use job::{AssembleSpec, EmitSpec, FilterSpec, ImageSpec, InferSpec, Job, JobSpec, NUMERICS_VERSION};
+pub use job::{
+    AssembleSpec, EmitSpec, FilterSpec, ImageSpec, InferSpec, Job, JobSpec, NUMERICS_VERSION, StitchSpec,
+};
 pub use jobs::{JobsError, jobs};
 pub use options::{MAX_DEPTHS, MIN_DEPTHS, PlanOptions, SamplingChoice};
 pub use plan::{Plan, RangeOrigin, SkipReason, ViewPlan, plan};

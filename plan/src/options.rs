@@ -38,6 +38,10 @@ pub struct PlanOptions {
     /// Depth range of every view in scene units, nearest and farthest; by default the scene's files
     /// or its sparse points say.
     pub depth_range: Option<(f64, f64)>,
+    /// Rows of the working image that one job infers, at least; by default a view is one job. The halo that a
+    /// band computes besides is about 120 rows on either side, so fewer than 512 rows waste work. Changes no
+    /// bit of the result.
+    pub band_rows: Option<u32>,
     /// Thresholds of the filters.
     pub filter: FilterOptions,
 }
@@ -51,6 +55,7 @@ impl Default for PlanOptions {
             depths: None,
             sampling: SamplingChoice::Auto,
             depth_range: None,
+            band_rows: None,
             filter: FilterOptions::default(),
         }
     }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::ops::Range;
 
 use nalgebra::Point3;
 use planesweep_scene::{Camera, DepthHypotheses, DepthRange, Scene, ViewId};
@@ -9,6 +10,7 @@ use rayon::iter::Either;
 use rayon::prelude::*;
 use serde::Serialize;
 
+use crate::bands::bands;
 use crate::depth_range::{choose_sampling, hypotheses, robust_range};
 use crate::options::PlanOptions;
 use crate::order::{order_views, symmetric_neighbours};
@@ -41,6 +43,8 @@ pub struct ViewPlan {
     pub range_origin: RangeOrigin,
     /// Size of the working image, not padded.
     pub working_size: (u32, u32),
+    /// Rows of the depth map that each of its inferences gives, from the top; empty when one gives all.
+    pub bands: Vec<Range<u32>>,
 }
 
 /// Where a depth range comes from.
@@ -124,6 +128,7 @@ pub fn plan(scene: &Scene, options: &PlanOptions) -> Plan {
             hypotheses,
             range_origin: origin,
             working_size,
+            bands: bands(reference.intrinsics.quartered().height, options.band_rows),
         })
     });
     let (mut views, refused): (Vec<ViewPlan>, Vec<ViewId>) =

@@ -25,6 +25,7 @@ mod pfm;
 mod raster;
 mod read;
 mod scene;
+mod stitch;
 mod training_sample;
 mod working_image;
 mod write;
@@ -41,6 +42,7 @@ pub use read::{
     resolve_inside, safe_name,
 };
 pub use scene::{DepthRange, Scene, SourceScore, SparsePoints, View};
+pub use stitch::StitchError;
 pub use training_sample::TrainingSample;
 pub use working_image::{PrepareError, WorkingImage};
 pub use write::{

@@ -21,4 +21,4 @@ pub use data::{reference_weights, shared_data};
 pub use faults::{children, is_alive, send, wait_until};
 pub use program::{Finished, Running, run};
 pub use results::{blobs, confident_share, files_below};
-pub use scenes::{courtyard, plane, seeded_weights};
+pub use scenes::{courtyard, plane, plane_of_size, seeded_weights};

@@ -19,10 +19,15 @@ pub fn courtyard(folder: &Path, views: usize, width: u32, height: u32) {
 /// Writes an MVSNet folder whose cameras see the plane z = 5 of the world, the one that the device
 /// `analytic` knows; the images show something else. Returns the scene.
 pub fn plane(folder: &Path, views: u32) -> Scene {
+    plane_of_size(folder, views, 160, 128)
+}
+
+/// The same with images of `width` by `height`.
+pub fn plane_of_size(folder: &Path, views: u32, width: u32, height: u32) -> Scene {
     let images = folder.join("images");
     fs::create_dir_all(&images).expect("made");
-    let (width, height) = (160, 128);
-    let intrinsics = Intrinsics { width, height, fx: 190.0, fy: 190.0, skew: 0.0, cx: 79.5, cy: 63.5 };
+    let (cx, cy) = (f64::from(width - 1) / 2.0, f64::from(height - 1) / 2.0);
+    let intrinsics = Intrinsics { width, height, fx: 190.0, fy: 190.0, skew: 0.0, cx, cy };
     let mut scene = Scene::default();
     for k in 0..views {
         let name = format!("{k:08}.png");

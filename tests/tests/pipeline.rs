@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use planesweep_fusion::read_ply;
-use planesweep_tests::{Bench, Finished, courtyard, files_below, plane, run};
+use planesweep_tests::{Bench, Finished, courtyard, files_below, plane, plane_of_size, run};
 use serde_json::Value;
 
 fn of_plane() -> Bench {
@@ -70,6 +70,30 @@ fn the_number_of_workers_changes_no_bit() {
         let read = |out: &str| bench.read(&format!("{out}/{name}"));
         assert!(read("one") == read("two"), "{name} differs");
     }
+}
+
+#[test]
+fn bands_of_rows_change_no_bit() {
+    // 2080 rows: four bands of 512 and more.
+    let bench = Bench::new(|folder| drop(plane_of_size(folder, 3, 64, 2080)));
+    let size = ["--depths", "16", "--max-size", "2080"];
+    let whole = bench.reconstruct("whole", &size).expect_code(0).json();
+    let options = [&size[..], &["--band-rows", "512", "--workers", "2"]].concat();
+    let banded = bench.reconstruct("banded", &options).expect_code(0).json();
+    assert!(whole["points"].as_u64() > Some(1000), "{}", whole["points"]);
+    assert!(bench.read("whole/cloud.ply") == bench.read("banded/cloud.ply"));
+    for name in ["depth/00000000.pfm", "confidence/00000002.pfm", "cams/00000001_cam.txt"] {
+        let read = |out: &str| bench.read(&format!("{out}/{name}"));
+        assert!(read("whole") == read("banded"), "{name} differs");
+    }
+    let seen = run(["inspect", &bench.scene(), "--max-size", "2080", "--band-rows", "512", "--json"])
+        .expect_code(0)
+        .json();
+    let bands = seen["plan"]["views"][0]["bands"].as_array().map(Vec::len);
+    assert_eq!(bands, Some(4));
+    let stages: Vec<String> =
+        banded["stages"].as_array().into_iter().flatten().map(|s| s[0].to_string()).collect();
+    assert!(stages.iter().any(|name| name.contains("stitch")), "{stages:?}");
 }
 
 #[test]

@@ -3,6 +3,7 @@
 //! libtorch keeps memory for every thread that ever ran it, and a forward pass cannot be awaited, so
 //! one OS thread per device loads the weights, runs every inference and lives as long as the worker.
 
+use std::ops::Range;
 use std::sync::Arc;
 use std::thread;
 
@@ -40,6 +41,8 @@ pub(crate) struct InferRequest {
     pub reference: Arc<WorkingImage>,
     pub sources: Vec<Arc<WorkingImage>>,
     pub hypotheses: DepthHypotheses,
+    /// Rows of the depth map; all without.
+    pub rows: Option<Range<usize>>,
 }
 
 struct Task {
@@ -87,6 +90,10 @@ fn run(factory: &BackendFactory, mut queue: mpsc::Receiver<Task>) {
         let sources: Vec<&WorkingImage> = request.sources.iter().map(AsRef::as_ref).collect();
         let input =
             InferInput { reference: &request.reference, sources: &sources, hypotheses: &request.hypotheses };
-        let _ = reply.send(backend.infer(input).map_err(DeviceError::Infer));
+        let map = match request.rows {
+            None => backend.infer(input),
+            Some(rows) => backend.infer_rows(input, rows),
+        };
+        let _ = reply.send(map.map_err(DeviceError::Infer));
     }
 }

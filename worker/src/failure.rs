@@ -4,6 +4,7 @@ use planesweep_fusion::EmptyCloud;
 use planesweep_mvsnet::InferError;
 use planesweep_plan::JobId;
 use planesweep_proto::Failure;
+use planesweep_scene::StitchError;
 use thiserror::Error;
 
 use crate::blob::BlobError;
@@ -50,7 +51,10 @@ pub enum JobError {
     /// The result could not be stored.
     #[error("cannot store the result")]
     Store(#[source] StoreError),
-    /// The depth map of the view itself failed for good.
+    /// Bands do not make a depth map.
+    #[error("cannot put the bands of the view together")]
+    Bands(#[from] StitchError),
+    /// The depth map of the view itself, or a band of it, failed for good.
     #[error("there is no depth map of the view itself")]
     NoDepthMap,
     /// No view gave a point.
@@ -84,6 +88,7 @@ impl JobError {
             Self::Malformed { .. } => ("input-malformed", true, true),
             Self::Input { .. } | Self::Weights(_) => ("store-read", true, true),
             Self::Store(_) => ("store-write", true, false),
+            Self::Bands(_) => ("bands", false, true),
             Self::NoDepthMap => ("no-depth-map", false, true),
             Self::EmptyCloud(_) => ("empty-cloud", false, true),
             Self::Panicked { .. } => ("panic", true, true),

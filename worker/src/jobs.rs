@@ -71,6 +71,10 @@ impl Jobs {
         let begun = Instant::now();
         let (bytes, measurements) = match &grant.spec {
             JobSpec::Infer(spec) => self.infer(spec, cancelled, started).await?,
+            JobSpec::Stitch(_) => {
+                started();
+                self.stitch(&grant.inputs).await?
+            }
             JobSpec::Filter(spec) => {
                 started();
                 self.filter(spec, &grant.inputs).await?
@@ -114,19 +118,30 @@ impl Jobs {
             reference,
             sources,
             hypotheses: spec.hypotheses,
+            rows: spec.rows.as_ref().map(|rows| rows.start as usize..rows.end as usize),
         };
         let map = self.device.infer(request).await?;
         drop(turn);
-        let confident = map.confidence.values().iter().filter(|c| **c > 0.8).count();
-        let measurements = BTreeMap::from([
-            ("network_seconds".to_owned(), begun.elapsed().as_secs_f64()),
-            ("confident_share".to_owned(), confident as f64 / map.confidence.values().len() as f64),
-        ]);
-        let map = Arc::new(map);
+        let network_seconds = ("network_seconds".to_owned(), begun.elapsed().as_secs_f64());
+        Ok((self.keep(map), BTreeMap::from([network_seconds])))
+    }
+
+    async fn stitch(&self, inputs: &[Input]) -> Result<Made, JobError> {
+        let mut bands = Vec::with_capacity(inputs.len());
+        for input in inputs {
+            bands.push(self.depth_map(input).await);
+        }
+        let bands =
+            all_or_lost(bands)?.into_iter().collect::<Option<Vec<_>>>().ok_or(JobError::NoDepthMap)?;
+        let bands: Vec<DepthMap> = bands.iter().map(|band| DepthMap::clone(band)).collect();
+        Ok((self.keep(DepthMap::stitch(&bands)?), BTreeMap::new()))
+    }
+
+    /// The map as bytes. It stays in memory too, for neighbouring views filter against it soon.
+    fn keep(&self, map: DepthMap) -> Vec<u8> {
         let bytes = encode_depth_map(&map);
-        // Neighbouring views filter against this map soon: keep it.
-        self.maps.insert(BlobKey::of(&bytes), map);
-        Ok((bytes, measurements))
+        self.maps.insert(BlobKey::of(&bytes), Arc::new(map));
+        bytes
     }
 
     async fn filter(&self, spec: &FilterSpec, inputs: &[Input]) -> Result<Made, JobError> {

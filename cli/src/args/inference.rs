@@ -38,6 +38,10 @@ pub struct PlanArgs {
     /// Spacing of the depth hypotheses.
     #[arg(long, value_enum, default_value = "auto")]
     pub sampling: SamplingArg,
+    /// Infer each view in bands of at least this many rows of the image, for several workers at once.
+    /// Changes no bit of the result.
+    #[arg(long, value_name = "ROWS", value_parser = clap::value_parser!(u32).range(512..=16384))]
+    pub band_rows: Option<u32>,
     /// Nearest and farthest depth of every view, in scene units; by default the sparse points decide.
     #[arg(long, value_name = "NEAR,FAR", value_parser = depth_range)]
     pub depth_range: Option<(f64, f64)>,
@@ -74,6 +78,7 @@ impl PlanArgs {
                 SamplingArg::Inverse => SamplingChoice::Inverse,
             },
             depth_range: self.depth_range,
+            band_rows: self.band_rows,
             filter: filter.map_or(defaults.filter, FilterArgs::options),
         }
     }

@@ -30,8 +30,8 @@ use crate::run_record::{FILE_NAME, RecordedView, RunRecord};
 /// Size of the picture of the cloud in the report.
 const CLOUD_PICTURE: (u32, u32) = (1280, 960);
 
-/// Results by kind of job and view.
-type ByView<'a> = BTreeMap<(&'static str, Option<ViewId>), &'a JobResult>;
+/// Results by kind of job and view; a view has several inferences when it is inferred in bands.
+type ByView<'a> = BTreeMap<(&'static str, Option<ViewId>), Vec<&'a JobResult>>;
 
 /// A run whose jobs have ended.
 pub struct Finished<'a> {
@@ -53,6 +53,19 @@ impl<'a> Finished<'a> {
         results: &'a [JobResult],
     ) -> Self {
         Self { args, prepared, store, runtime, results, by_view: by_view(&prepared.jobs, results) }
+    }
+
+    fn result(&self, kind: &'static str, view: Option<ViewId>) -> Option<&'a JobResult> {
+        self.by_view.get(&(kind, view))?.last().copied()
+    }
+
+    /// The job whose result is the depth map of a view.
+    fn depth_map(&self, view: ViewId) -> Option<&'a JobResult> {
+        self.result("stitch", Some(view)).or_else(|| self.result("infer", Some(view)))
+    }
+
+    fn infer_seconds(&self, view: ViewId) -> f64 {
+        self.by_view.get(&("infer", Some(view))).into_iter().flatten().map(|result| own_seconds(result)).sum()
     }
 }
 
@@ -81,9 +94,11 @@ pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Out
     let points = vertices(&cloud).count() as u64;
 
     // Kinds of jobs overlap in time and run on several workers, so these are sums, not parts.
-    for kind in ["infer", "filter", "emit", "assemble"] {
-        let seconds = run.results.iter().filter(|r| r.kind == kind).map(own_seconds).sum();
-        stages.push((format!("{kind}, summed"), seconds));
+    for kind in ["infer", "stitch", "filter", "emit", "assemble"] {
+        let of_kind = run.results.iter().filter(|result| result.kind == kind);
+        if of_kind.clone().next().is_some() {
+            stages.push((format!("{kind}, summed"), of_kind.map(own_seconds).sum()));
+        }
     }
     stages.push(("write".to_owned(), writing.elapsed().as_secs_f64()));
     let record = record(run, &exported, &skipped, cloud_key, points);
@@ -124,9 +139,13 @@ fn own_seconds(result: &JobResult) -> f64 {
 /// content share their jobs.
 fn by_view<'a>(jobs: &[Job], results: &'a [JobResult]) -> ByView<'a> {
     let by_id: BTreeMap<JobId, &JobResult> = results.iter().map(|result| (result.job, result)).collect();
-    let found =
-        jobs.iter().filter_map(|job| Some(((job.spec.kind(), job.spec.view()), *by_id.get(&job.id)?)));
-    found.collect()
+    let mut found = ByView::new();
+    for job in jobs {
+        if let Some(result) = by_id.get(&job.id) {
+            found.entry((job.spec.kind(), job.spec.view())).or_default().push(result);
+        }
+    }
+    found
 }
 
 fn blob(run: &Finished<'_>, result: &JobResult) -> Result<Option<Bytes>> {
@@ -137,20 +156,20 @@ fn blob(run: &Finished<'_>, result: &JobResult) -> Result<Option<Bytes>> {
 /// Writes depth, confidence and preview; `None` when the view's inference failed.
 fn export_view(run: &Finished<'_>, out: &OutFolder, plan: &ViewPlan) -> Result<Option<ExportedView>> {
     let view = &run.prepared.input.scene.views[&plan.view];
-    let Some(infer) = run.by_view.get(&("infer", Some(plan.view))) else { return Ok(None) };
-    let Some(bytes) = blob(run, infer)? else { return Ok(None) };
+    let Some(map) = run.depth_map(plan.view) else { return Ok(None) };
+    let Some(bytes) = blob(run, map)? else { return Ok(None) };
     let map =
         decode_depth_map(&bytes).with_context(|| format!("cannot read the depth map of {}", view.name))?;
     let mut funnel = Funnel { pixels: map.depth.values().len() as u64, ..Funnel::default() };
     let mut kept = Raster::filled(map.width(), map.height(), false);
-    let filter = run.by_view.get(&("filter", Some(plan.view))).copied();
+    let filter = run.result("filter", Some(plan.view));
     if let Some(bytes) = filter.map(|result| blob(run, result)).transpose()?.flatten() {
         let filtered =
             decode_filtered_map(&bytes).with_context(|| format!("cannot read the mask of {}", view.name))?;
         kept = filtered.depth.map(|depth| *depth > 0.0);
         (funnel.photometric, funnel.geometric) = (filtered.funnel.photometric, filtered.funnel.geometric);
     }
-    let emit = run.by_view.get(&("emit", Some(plan.view))).copied();
+    let emit = run.result("emit", Some(plan.view));
     funnel.emitted = emit.and_then(|r| r.measurements.get("points")).map_or(0, |points| *points as u64);
     let files = out.write_map(plan.view, &map, &kept, &plan.hypotheses)?;
     let names =
@@ -166,7 +185,7 @@ fn export_view(run: &Finished<'_>, out: &OutFolder, plan: &ViewPlan) -> Result<O
         sampling: plan.hypotheses.sampling(),
         sources: names(&plan.sources),
         funnel,
-        seconds: own_seconds(infer),
+        seconds: run.infer_seconds(plan.view),
         preview: Some(files.preview_name),
         warnings: [filter, emit].into_iter().flatten().filter_map(failure).collect(),
     };
@@ -211,7 +230,7 @@ fn write_mvsnet_side(out: &OutFolder, views: &[ExportedView]) -> Result<()> {
 }
 
 fn write_cloud(run: &Finished<'_>, out: &OutFolder) -> Result<(BlobKey, Bytes)> {
-    let assembled = *run.by_view.get(&("assemble", None)).context("the ledger knows no cloud")?;
+    let assembled = run.result("assemble", None).context("the ledger knows no cloud")?;
     let Some((key, _)) = assembled.blob else {
         let (_, message) = assembled.failure.clone().unwrap_or_default();
         bail!("there is no cloud: {message}; previews of the depth maps are in {}", out.root().display());

@@ -96,7 +96,10 @@ fn row(scene: &Scene, plan: &ViewPlan) -> Vec<String> {
             Distortion::OpenCv { .. } => "opencv",
         }
         .to_owned(),
-        format!("{}x{}", plan.working_size.0, plan.working_size.1),
+        match plan.bands.len() {
+            0 => format!("{}x{}", plan.working_size.0, plan.working_size.1),
+            bands => format!("{}x{} in {bands} bands", plan.working_size.0, plan.working_size.1),
+        },
         format!("{:.4} to {:.4}", planes.min(), planes.max()),
         match plan.range_origin {
             RangeOrigin::Option => "option".to_owned(),

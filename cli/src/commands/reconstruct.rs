@@ -269,10 +269,10 @@ async fn follow(
                 infer_seconds += result.measurements.get("network_seconds").unwrap_or(&result.seconds);
             }
         }
-        let per_view = if inferred > 0 { infer_seconds / f64::from(inferred) } else { 0.0 };
+        let each = if inferred > 0 { infer_seconds / f64::from(inferred) } else { 0.0 };
         progress.show(
             status.count(JobState::Done) + status.count(JobState::Failed),
-            format!("{}, {per_view:.1} s a view", depth_maps_done(&status)),
+            format!("{}, {each:.1} s each", inferences_done(&status)),
         );
         if status.waiting.is_some_and(|w| w > Duration::from_secs(15)) != was_waiting {
             was_waiting = !was_waiting;
@@ -293,7 +293,7 @@ async fn follow(
     }
 }
 
-fn depth_maps_done(status: &RunStatus) -> String {
+fn inferences_done(status: &RunStatus) -> String {
     let of = |wanted: Option<JobState>| -> u64 {
         let counts = status.counts.iter();
         counts
@@ -301,7 +301,7 @@ fn depth_maps_done(status: &RunStatus) -> String {
             .map(|(_, n)| n)
             .sum()
     };
-    format!("{} of {} depth maps", of(Some(JobState::Done)), of(None))
+    format!("{} of {} inferences", of(Some(JobState::Done)), of(None))
 }
 
 /// What Ctrl-C means at the moment.

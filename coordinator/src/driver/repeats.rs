@@ -42,6 +42,7 @@ fn nameless(job: &Job) -> Job {
             spec.reference = image(&spec.reference);
             spec.sources = spec.sources.iter().map(image).collect();
         }
+        JobSpec::Stitch(spec) => spec.view = ViewId(0),
         JobSpec::Filter(spec) => {
             spec.view = ViewId(0);
             spec.neighbours.fill(ViewId(0));

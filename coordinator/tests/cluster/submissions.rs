@@ -32,6 +32,7 @@ fn rename(jobs: &mut [Job], by: u32, folder: &Path) {
                     image.path = folder.join(&image.path);
                 }
             }
+            JobSpec::Stitch(spec) => renumber(&mut spec.view),
             JobSpec::Filter(spec) => {
                 renumber(&mut spec.view);
                 spec.neighbours.iter_mut().for_each(renumber);

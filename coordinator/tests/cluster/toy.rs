@@ -47,6 +47,7 @@ pub(crate) fn plan(views: u32) -> Vec<Job> {
             reference: image(view),
             sources: vec![image(next(view))],
             hypotheses: DepthHypotheses::new(Sampling::Uniform, 1.0, 9.0, 64).expect("a valid range"),
+            rows: None,
             weights: BlobKey::of(b"weights"),
         };
         jobs.push(Job { id: id("infer", view), spec: JobSpec::Infer(spec), needs: vec![] });

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use nalgebra::{Matrix3, Vector3};
 use planesweep_fusion::{DepthSampling, FilterOptions};
 use planesweep_plan::{
-    AssembleSpec, BlobKey, EmitSpec, FilterSpec, ImageSpec, InferSpec, Job, JobId, JobSpec,
+    AssembleSpec, BlobKey, EmitSpec, FilterSpec, ImageSpec, InferSpec, Job, JobId, JobSpec, StitchSpec,
 };
 use planesweep_scene::{
     Camera, CameraError, DepthHypotheses, Distortion, Intrinsics, Pose, Sampling, ViewId,
@@ -65,6 +65,7 @@ impl From<&JobSpec> for wire::JobSpec {
         Self {
             spec: Some(match spec {
                 JobSpec::Infer(spec) => Spec::Infer(spec.into()),
+                JobSpec::Stitch(spec) => Spec::Stitch(wire::StitchSpec { view: spec.view.0 }),
                 JobSpec::Filter(spec) => Spec::Filter(wire::FilterSpec {
                     view: spec.view.0,
                     neighbours: numbers(&spec.neighbours),
@@ -86,6 +87,7 @@ impl TryFrom<wire::JobSpec> for JobSpec {
         use wire::job_spec::Spec;
         Ok(match required("spec", spec.spec)? {
             Spec::Infer(spec) => Self::Infer(spec.try_into()?),
+            Spec::Stitch(spec) => Self::Stitch(StitchSpec { view: ViewId(spec.view) }),
             Spec::Filter(spec) => Self::Filter(FilterSpec {
                 view: ViewId(spec.view),
                 neighbours: views("neighbours", spec.neighbours)?,
@@ -125,6 +127,7 @@ impl From<&InferSpec> for wire::InferSpec {
                 count: spec.hypotheses.count(),
             }),
             weights: spec.weights.0.to_vec(),
+            rows: spec.rows.as_ref().map(|rows| wire::Rows { start: rows.start, end: rows.end }),
         }
     }
 }
@@ -137,10 +140,20 @@ impl TryFrom<wire::InferSpec> for InferSpec {
         if spec.sources.is_empty() {
             return Err(WireError::Missing { field: "sources" });
         }
+        let reference: ImageSpec = required("reference", spec.reference)?.try_into()?;
+        let height = reference.working_height.div_ceil(4);
+        let rows = match spec.rows {
+            None => None,
+            Some(rows) => {
+                let end = in_range("end of the rows", rows.end, 1, height)?;
+                Some(in_range("start of the rows", rows.start, 0, end - 1)?..end)
+            }
+        };
         Ok(Self {
-            reference: required("reference", spec.reference)?.try_into()?,
+            reference,
             sources: each(spec.sources, TryInto::try_into)?,
             hypotheses: required("hypotheses", spec.hypotheses)?.try_into()?,
+            rows,
             weights: blob_key("weights", &spec.weights)?,
         })
     }
@@ -385,8 +398,14 @@ mod tests {
                 let sampling = if inverse { Sampling::Inverse } else { Sampling::Uniform };
                 DepthHypotheses::new(sampling, min, min * ratio, count).expect("a valid range")
             });
-        (image(), vec(image(), 1..4), planes, any::<[u8; 32]>()).prop_map(
-            |(reference, sources, hypotheses, weights)| InferSpec {
+        let of_map = any::<Option<(prop::sample::Index, prop::sample::Index)>>();
+        (image(), vec(image(), 1..4), planes, any::<[u8; 32]>(), of_map).prop_map(
+            |(reference, sources, hypotheses, weights, rows)| InferSpec {
+                rows: rows.map(|(start, length)| {
+                    let height = reference.working_height.div_ceil(4) as usize;
+                    let start = start.index(height);
+                    start as u32..(start + 1 + length.index(height - start)) as u32
+                }),
                 reference,
                 sources,
                 hypotheses,
@@ -416,6 +435,7 @@ mod tests {
     fn job() -> impl Strategy<Value = Job> {
         let spec = prop_oneof![
             infer().prop_map(JobSpec::Infer),
+            any::<u32>().prop_map(|view| JobSpec::Stitch(StitchSpec { view: ViewId(view) })),
             filter().prop_map(JobSpec::Filter),
             (any::<u32>(), view_list())
                 .prop_map(|(view, neighbours)| JobSpec::Emit(EmitSpec { view: ViewId(view), neighbours })),
