@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use planesweep_fusion::DepthSampling;
-use planesweep_scene::{Camera, DepthHypotheses, Distortion, Sampling, Scene, ViewId};
+use planesweep_scene::{Camera, DepthHypotheses, Sampling, Scene, ViewId};
 use thiserror::Error;
 
 use crate::job::{
@@ -33,12 +33,13 @@ pub fn jobs(
     image_hashes: &BTreeMap<ViewId, BlobKey>,
     weights: BlobKey,
 ) -> Result<Vec<Job>, JobsError> {
+    let cameras = scene.undistorted_cameras();
     let image = |view: ViewId| -> Result<ImageSpec, JobsError> {
         let unknown = JobsError::UnknownView { view };
         let (Some(known), Some(hash)) = (scene.views.get(&view), image_hashes.get(&view)) else {
             return Err(unknown);
         };
-        let size = &known.camera.intrinsics;
+        let size = &cameras[&view].intrinsics;
         let (working_width, working_height) = working_size(size.width, size.height, plan.options.max_size);
         Ok(ImageSpec {
             view,
@@ -172,13 +173,8 @@ impl Digest {
     fn image(&mut self, image: &ImageSpec) {
         self.bytes(&image.hash.0);
         self.camera(&image.camera);
-        let coefficients = match image.distortion {
-            Distortion::None => vec![],
-            Distortion::Radial { k1, k2 } => vec![k1, k2],
-            Distortion::OpenCv { k1, k2, p1, p2 } => vec![k1, k2, p1, p2],
-        };
-        self.u32(coefficients.len() as u32);
-        for coefficient in coefficients {
+        self.bytes(image.distortion.model().as_bytes());
+        for coefficient in image.distortion.coefficients() {
             self.f64(coefficient);
         }
         self.u32(image.working_width);
@@ -201,7 +197,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     use nalgebra::{Point3, Vector3};
-    use planesweep_scene::{DepthRange, Intrinsics, Pose, View};
+    use planesweep_scene::{DepthRange, Distortion, Intrinsics, Pose, View};
 
     use super::*;
     use crate::{PlanOptions, plan};

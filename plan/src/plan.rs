@@ -89,7 +89,8 @@ const LENDING_NEIGHBOURS: usize = 4;
 /// Decides for every view what is to be done. Pure: the same scene and options give the same plan.
 pub fn plan(scene: &Scene, options: &PlanOptions) -> Plan {
     let stated = stated_ranges(scene, options);
-    let mut ranking = rank_sources(scene, &stated);
+    let cameras = scene.undistorted_cameras();
+    let mut ranking = rank_sources(scene, &cameras, &stated);
     let seen = points_by_view(scene);
     let mut skipped = BTreeMap::new();
     let mut ranges = BTreeMap::new();
@@ -97,7 +98,7 @@ pub fn plan(scene: &Scene, options: &PlanOptions) -> Plan {
         let sources = ranking.get(&view).map_or(&[][..], Vec::as_slice);
         if sources.is_empty() {
             skipped.insert(view, SkipReason::Isolated);
-        } else if let Some(range) = range_of(scene, options, &stated, &seen, &ranking, view) {
+        } else if let Some(range) = range_of(&cameras[&view], options, &stated, &seen, &ranking, view) {
             ranges.insert(view, range);
         } else {
             skipped.insert(view, SkipReason::NoDepthRange);
@@ -114,7 +115,7 @@ pub fn plan(scene: &Scene, options: &PlanOptions) -> Plan {
         let (range, origin) = ranges[&view];
         let best: Vec<ViewId> =
             sources[&view].iter().map(|s| s.view).take(options.views.max(2) as usize - 1).collect();
-        let working = |id: ViewId| working_camera(&scene.views[&id].camera, options);
+        let working = |id: ViewId| working_camera(&cameras[&id], options);
         let reference = working(view);
         let sampling = choose_sampling(options.sampling, &range);
         let points = seen.get(&view).map_or(&[][..], Vec::as_slice);
@@ -170,7 +171,7 @@ fn points_by_view(scene: &Scene) -> BTreeMap<ViewId, Vec<Point3<f64>>> {
 }
 
 fn range_of(
-    scene: &Scene,
+    camera: &Camera,
     options: &PlanOptions,
     stated: &BTreeMap<ViewId, DepthRange>,
     seen: &BTreeMap<ViewId, Vec<Point3<f64>>>,
@@ -181,7 +182,6 @@ fn range_of(
         let origin = if options.depth_range.is_some() { RangeOrigin::Option } else { RangeOrigin::File };
         return Some((*range, origin));
     }
-    let camera = &scene.views[&view].camera;
     let depth = |point: &Point3<f64>| camera.pose.to_camera(point).z;
     let own = seen.get(&view).map_or(&[][..], Vec::as_slice);
     if let Some(range) = robust_range(own.iter().map(depth).collect()) {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::{Point2, Point3};
-use planesweep_scene::{Camera, DepthRange, Scene, SourceScore, SparsePoints, View, ViewId};
+use planesweep_scene::{Camera, DepthRange, Scene, SourceScore, SparsePoints, ViewId};
 use rayon::prelude::*;
 
 /// The baseline angle that counts most, in degrees.
@@ -37,8 +37,13 @@ fn angle_deg(point: &Point3<f64>, centre_a: &Point3<f64>, centre_b: &Point3<f64>
 }
 
 /// Ranks source views by what the scene knows: common tracks, else its pair file, else (for views
-/// that the pair file leaves out, too) the overlap of frusta between `ranges`.
-pub fn rank_sources(scene: &Scene, ranges: &BTreeMap<ViewId, DepthRange>) -> SourceRanking {
+/// that the pair file leaves out, too) the overlap between `ranges` of the frusta of `cameras`, those of
+/// the undistorted images.
+pub fn rank_sources(
+    scene: &Scene,
+    cameras: &BTreeMap<ViewId, Camera>,
+    ranges: &BTreeMap<ViewId, DepthRange>,
+) -> SourceRanking {
     if !scene.points.is_empty() {
         return rank_by_tracks(scene);
     }
@@ -46,8 +51,8 @@ pub fn rank_sources(scene: &Scene, ranges: &BTreeMap<ViewId, DepthRange>) -> Sou
     let listed = scene.pairs.iter().filter(|(id, _)| scene.views.contains_key(id));
     let mut ranking: SourceRanking =
         listed.map(|(id, sources)| (*id, sources.iter().copied().filter(known).collect())).collect();
-    let unlisted: Vec<&View> = scene.views.values().filter(|view| !ranking.contains_key(&view.id)).collect();
-    ranking.par_extend(unlisted.par_iter().map(|view| (view.id, rank_by_overlap(scene, ranges, view))));
+    let unlisted: Vec<ViewId> = scene.views.keys().copied().filter(|id| !ranking.contains_key(id)).collect();
+    ranking.par_extend(unlisted.par_iter().map(|id| (*id, rank_by_overlap(cameras, ranges, *id))));
     ranking
 }
 
@@ -142,20 +147,21 @@ impl<'a> Tracks<'a> {
 /// Scores each source by the grid points of the reference frustum that it sees, each weighted by its
 /// baseline angle.
 fn rank_by_overlap(
-    scene: &Scene,
+    cameras: &BTreeMap<ViewId, Camera>,
     ranges: &BTreeMap<ViewId, DepthRange>,
-    reference: &View,
+    reference: ViewId,
 ) -> Vec<SourceScore> {
-    let range = ranges.get(&reference.id);
-    let points = range.map_or_else(Vec::new, |range| frustum_points(&reference.camera, range));
-    let centre = reference.camera.pose.centre();
+    let camera = &cameras[&reference];
+    let range = ranges.get(&reference);
+    let points = range.map_or_else(Vec::new, |range| frustum_points(camera, range));
+    let centre = camera.pose.centre();
     let score_of = |source: &Camera| -> f64 {
         let other = source.pose.centre();
         let seen = points.iter().filter(|point| sees(source, point));
         seen.map(|point| angle_score(angle_deg(point, &centre, &other))).sum()
     };
-    let others = scene.views.values().filter(|source| source.id != reference.id);
-    let scores = others.map(|source| SourceScore { view: source.id, score: score_of(&source.camera) });
+    let others = cameras.iter().filter(|(source, _)| **source != reference);
+    let scores = others.map(|(source, camera)| SourceScore { view: *source, score: score_of(camera) });
     ranked(scores.filter(|source| source.score > 0.0).collect())
 }
 
@@ -191,7 +197,7 @@ fn ranked(mut scores: Vec<SourceScore>) -> Vec<SourceScore> {
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector3;
-    use planesweep_scene::{Distortion, Intrinsics, Pose};
+    use planesweep_scene::{Distortion, Intrinsics, Pose, View};
 
     use super::*;
 
@@ -216,6 +222,10 @@ mod tests {
         scene
     }
 
+    fn rank(scene: &Scene, ranges: &BTreeMap<ViewId, DepthRange>) -> SourceRanking {
+        rank_sources(scene, &scene.undistorted_cameras(), ranges)
+    }
+
     #[test]
     fn the_angle_is_measured_between_normalised_rays_in_degrees() {
         let origin = Point3::new(0.0, 0.0, 10.0);
@@ -233,7 +243,7 @@ mod tests {
         let all_but_last = [ViewId(1), ViewId(11), ViewId(21), ViewId(31)];
         scene.points.push(Point3::new(0.0, 0.0, 10.0), all_but_last);
         scene.points.push(Point3::new(0.0, 0.0, 10.0), [ViewId(41), ViewId(999)]);
-        let ranking = rank_sources(&scene, &BTreeMap::new());
+        let ranking = rank(&scene, &BTreeMap::new());
         let order: Vec<u32> = ranking[&ViewId(1)].iter().map(|s| s.view.0).collect();
         assert_eq!(order, [21, 31, 11]);
         assert!(ranking[&ViewId(41)].is_empty(), "a view that shares nothing has no sources");
@@ -247,7 +257,7 @@ mod tests {
             let point = Point3::new(0.1 * k as f64 - 2.0, 0.05 * k as f64, 8.0 + 0.2 * k as f64);
             scene.points.push(point, ids.iter().copied().filter(|id| (k + id.0) % 3 != 0));
         }
-        let ranking = rank_sources(&scene, &BTreeMap::new());
+        let ranking = rank(&scene, &BTreeMap::new());
         let score = |a: ViewId, b: ViewId| ranking[&a].iter().find(|s| s.view == b).map_or(0.0, |s| s.score);
         for &a in &ids {
             for &b in ids.iter().filter(|b| **b != a) {
@@ -265,9 +275,9 @@ mod tests {
         let scene = scene_with_centres(&[0.0, 1.0, 60.0]);
         let range = DepthRange { min: 8.0, max: 12.0, count: None };
         let ranges = scene.views.keys().map(|id| (*id, range)).collect();
-        let ranking = rank_sources(&scene, &ranges);
+        let ranking = rank(&scene, &ranges);
         assert_eq!(ranking[&ViewId(1)][0].view, ViewId(11));
-        assert!(rank_sources(&scene, &BTreeMap::new())[&ViewId(1)].is_empty());
+        assert!(rank(&scene, &BTreeMap::new())[&ViewId(1)].is_empty());
     }
 
     #[test]
@@ -277,7 +287,7 @@ mod tests {
         scene.pairs.insert(ViewId(1), vec![stated(21), stated(99)]);
         let range = DepthRange { min: 8.0, max: 12.0, count: None };
         let ranges = scene.views.keys().map(|id| (*id, range)).collect();
-        let ranking = rank_sources(&scene, &ranges);
+        let ranking = rank(&scene, &ranges);
         assert_eq!(ranking[&ViewId(1)], [stated(21)]);
         assert_eq!(ranking[&ViewId(11)].len(), 2);
     }

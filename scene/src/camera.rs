@@ -1,4 +1,4 @@
-//! Pinhole cameras, their poses, and the lens distortions that photographs still carry.
+//! Pinhole cameras and their poses.
 
 use nalgebra::{Matrix3, Matrix3x4, Point2, Point3, Vector3};
 use serde::{Deserialize, Serialize};
@@ -8,7 +8,7 @@ use thiserror::Error;
 const ROTATION_TOLERANCE: f64 = 1e-3;
 
 /// Why a camera is refused.
-#[derive(Debug, Error, PartialEq)]
+#[derive(Clone, Debug, Error, PartialEq)]
 pub enum CameraError {
     /// A number is NaN or infinite.
     #[error("{field} is not finite")]
@@ -221,53 +221,6 @@ impl Camera {
         extrinsic.fixed_view_mut::<3, 3>(0, 0).copy_from(&self.pose.rotation);
         extrinsic.set_column(3, &self.pose.translation);
         self.intrinsics.matrix() * extrinsic
-    }
-}
-
-/// What a lens does to normalised image coordinates `(x, y) = (X/Z, Y/Z)` before `K` applies.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub enum Distortion {
-    /// Nothing: the image is that of a pinhole camera.
-    None,
-    /// COLMAP's SIMPLE_RADIAL and RADIAL: `1 + k1 r^2 + k2 r^4`.
-    Radial {
-        /// Coefficient of `r^2`.
-        k1: f64,
-        /// Coefficient of `r^4`.
-        k2: f64,
-    },
-    /// COLMAP's and OpenCV's four-parameter model: radial and tangential.
-    OpenCv {
-        /// Coefficient of `r^2`.
-        k1: f64,
-        /// Coefficient of `r^4`.
-        k2: f64,
-        /// First tangential coefficient.
-        p1: f64,
-        /// Second tangential coefficient.
-        p2: f64,
-    },
-}
-
-impl Distortion {
-    /// Where the lens moves an undistorted normalised point.
-    #[inline]
-    pub fn distort(&self, x: f64, y: f64) -> (f64, f64) {
-        let r2 = x * x + y * y;
-        match *self {
-            Self::None => (x, y),
-            Self::Radial { k1, k2 } => {
-                let factor = 1.0 + r2 * (k1 + r2 * k2);
-                (x * factor, y * factor)
-            }
-            Self::OpenCv { k1, k2, p1, p2 } => {
-                let factor = 1.0 + r2 * (k1 + r2 * k2);
-                (
-                    x * factor + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-                    y * factor + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-                )
-            }
-        }
     }
 }
 

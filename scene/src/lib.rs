@@ -17,6 +17,7 @@
 
 mod camera;
 mod depth_map;
+mod distortion;
 mod hypotheses;
 mod ids;
 mod image;
@@ -27,23 +28,26 @@ mod read;
 mod scene;
 mod stitch;
 mod training_sample;
+mod undistort;
 mod working_image;
 mod write;
 
-pub use camera::{Camera, CameraError, Distortion, Intrinsics, Pose};
+pub use camera::{Camera, CameraError, Intrinsics, Pose};
 pub use depth_map::{DepthMap, DepthMapError};
+pub use distortion::Distortion;
 pub use hypotheses::{DepthHypotheses, HypothesesError, Sampling};
 pub use ids::ViewId;
 pub use image::{ImageError, MAX_PIXELS, SizeMismatch, decode_image, fit_to_image, image_size, read_image};
 pub use pfm::{PfmError, PfmFormatError, decode_pfm, encode_pfm, read_depth_pfm, read_pfm, write_pfm};
 pub use raster::{Raster, RasterError};
 pub use read::{
-    DepthLine, NameError, PixelCentre, ReadError, ReadOptions, ResolveError, ViewError, read_scene,
-    resolve_inside, safe_name,
+    DepthLine, NameError, PixelCentre, ReadError, ReadOptions, ResolveError, SceneFormat, ViewError,
+    read_scene, resolve_inside, safe_name,
 };
 pub use scene::{DepthRange, Scene, SourceScore, SparsePoints, View};
 pub use stitch::StitchError;
 pub use training_sample::TrainingSample;
+pub use undistort::undistorted_intrinsics;
 pub use working_image::{PrepareError, WorkingImage};
 pub use write::{
     WriteError, mvsnet_cam_text, mvsnet_pair_text, write_atomically, write_colmap, write_mvsnet,

@@ -1,12 +1,12 @@
 //! A scene: what every reader makes, and all that planning needs.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 
 use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
-use crate::{Camera, Distortion, ViewId};
+use crate::{Camera, Distortion, Intrinsics, ViewId, undistorted_intrinsics};
 
 /// Photographs with known cameras, and what is known of the surface.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -39,6 +39,28 @@ pub struct View {
     pub distortion: Distortion,
     /// The depth range, when the scene's files name it.
     pub depth_range: Option<DepthRange>,
+}
+
+impl Scene {
+    /// The pinhole camera of every view's undistorted image, at full size. A lens that many views
+    /// share is looked at once.
+    pub fn undistorted_cameras(&self) -> BTreeMap<ViewId, Camera> {
+        type Lens = (u32, u32, [u64; 5], &'static str, Vec<u64>);
+        let mut known: BTreeMap<Lens, Intrinsics> = BTreeMap::new();
+        let mut undistorted = |view: &View| {
+            let k = &view.camera.intrinsics;
+            if view.distortion == Distortion::None {
+                return view.camera;
+            }
+            let inner = [k.fx, k.fy, k.skew, k.cx, k.cy].map(f64::to_bits);
+            let coefficients = view.distortion.coefficients().into_iter().map(f64::to_bits).collect();
+            let lens = (k.width, k.height, inner, view.distortion.model(), coefficients);
+            let intrinsics =
+                *known.entry(lens).or_insert_with(|| undistorted_intrinsics(k, &view.distortion));
+            Camera { intrinsics, ..view.camera }
+        };
+        self.views.values().map(|view| (view.id, undistorted(view))).collect()
+    }
 }
 
 /// A depth range as a file states it, in scene units.
@@ -79,9 +101,21 @@ impl Default for SparsePoints {
 impl SparsePoints {
     /// Adds a point (world) with the views that see it; a view seen twice counts once.
     pub fn push(&mut self, position: Point3<f64>, track: impl IntoIterator<Item = ViewId>) {
+        /// From this length on, looking through the track would take longer than a set does.
+        const LONG: usize = 64;
         let start = self.track_views.len();
+        let mut seen = HashSet::new();
         for view in track {
-            if !self.track_views[start..].contains(&view) {
+            let known = &self.track_views[start..];
+            let is_new = if known.len() < LONG {
+                !known.contains(&view)
+            } else {
+                if seen.is_empty() {
+                    seen.extend(known.iter().copied());
+                }
+                seen.insert(view)
+            };
+            if is_new {
                 self.track_views.push(view);
             }
         }

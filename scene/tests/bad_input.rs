@@ -155,10 +155,57 @@ fn hostile_image_names_are_refused() {
 }
 
 #[test]
+fn every_camera_model_is_read() {
+    let zero = Distortion::Fisheye { k1: 0.0, k2: 0.0, k3: 0.0, k4: 0.0 };
+    for (camera, lens) in [
+        ("SIMPLE_PINHOLE 16 12 20 8.5 6.5", Distortion::None),
+        ("PINHOLE 16 12 20 20 8.5 6.5", Distortion::None),
+        ("SIMPLE_RADIAL 16 12 20 8.5 6.5 .1", Distortion::Radial { k1: 0.1, k2: 0.0 }),
+        ("RADIAL 16 12 20 8.5 6.5 .1 .2", Distortion::Radial { k1: 0.1, k2: 0.2 }),
+        ("OPENCV 16 12 20 20 8.5 6.5 .1 .2 .3 .4", Distortion::OpenCv { k1: 0.1, k2: 0.2, p1: 0.3, p2: 0.4 }),
+        (
+            "OPENCV_FISHEYE 16 12 20 20 8.5 6.5 .1 .2 .3 .4",
+            Distortion::Fisheye { k1: 0.1, k2: 0.2, k3: 0.3, k4: 0.4 },
+        ),
+        (
+            "FULL_OPENCV 16 12 20 20 8.5 6.5 .1 .2 .3 .4 .5 .6 .7 .8",
+            Distortion::FullOpenCv { k1: 0.1, k2: 0.2, p1: 0.3, p2: 0.4, k3: 0.5, k4: 0.6, k5: 0.7, k6: 0.8 },
+        ),
+        ("FOV 16 12 20 20 8.5 6.5 .9", Distortion::Fov { omega: 0.9 }),
+        (
+            "SIMPLE_RADIAL_FISHEYE 16 12 20 8.5 6.5 .1",
+            Distortion::Fisheye { k1: 0.1, k2: 0.0, k3: 0.0, k4: 0.0 },
+        ),
+        ("RADIAL_FISHEYE 16 12 20 8.5 6.5 .1 .2", Distortion::Fisheye { k1: 0.1, k2: 0.2, k3: 0.0, k4: 0.0 }),
+        (
+            "THIN_PRISM_FISHEYE 16 12 20 20 8.5 6.5 .1 .2 .3 .4 .5 .6 .7 .8",
+            Distortion::ThinPrismFisheye {
+                k1: 0.1,
+                k2: 0.2,
+                p1: 0.3,
+                p2: 0.4,
+                k3: 0.5,
+                k4: 0.6,
+                sx1: 0.7,
+                sy1: 0.8,
+            },
+        ),
+        ("SIMPLE_FISHEYE 16 12 20 8.5 6.5", zero),
+        ("FISHEYE 16 12 20 20 8.5 6.5", zero),
+    ] {
+        let folder = model(&format!("1 {camera}"), &["1 1 0 0 0 0 0 0 1 a.png"], "");
+        let view = read(&folder).expect(camera).views[&ViewId(1)].clone();
+        assert_eq!(view.distortion, lens, "{camera}");
+        let k = view.camera.intrinsics;
+        assert_eq!((k.fx, k.fy, k.cx, k.cy), (20.0, 20.0, 8.0, 6.0), "{camera}");
+    }
+}
+
+#[test]
 fn camera_models_that_are_not_supported_are_named() {
-    let cameras = format!("{CAMERA}\n2 FOV 16 12 20 20 8 6 0.9");
+    let cameras = format!("{CAMERA}\n2 DIVISION 16 12 20 20 8 6 0.9");
     let folder = model(&cameras, &["1 1 0 0 0 0 0 0 2 a.png", "2 1 0 0 0 0 0 0 1 b.png"], "");
-    assert_bad_view(&folder, &["camera model FOV is not supported"]);
+    assert_bad_view(&folder, &["camera model DIVISION is not supported"]);
     let folder = model("1 WARP 16 12 20", &[], "");
     assert!(text(&read(&folder).expect_err("unknown")).contains("at line 2: camera 1 has the unknown model"));
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use nalgebra::Point2;
 use planesweep_scene::{
     DepthRange, Distortion, ReadOptions, Scene, View, ViewId, WorkingImage, image_size, read_image,
-    read_scene,
+    read_scene, undistorted_intrinsics,
 };
 
 /// The folder of a shared scene, or a line that says that the test was skipped.
@@ -72,7 +72,8 @@ fn a_photograph_becomes_a_working_image() {
     let stored = read_image(&view.image).expect("a photograph");
     let working = WorkingImage::prepare(stored, &view.camera, &view.distortion, 1152, 866).expect("prepared");
     assert_eq!((working.pixels.width(), working.pixels.height()), (1152, 866));
-    assert_eq!(working.camera.intrinsics, view.camera.intrinsics.resized(1152, 866));
+    let pinhole = undistorted_intrinsics(&view.camera.intrinsics, &view.distortion);
+    assert_eq!(working.camera.intrinsics, pinhole.resized(1152, 866));
     let colors = working.map_colors(288, 217);
     assert_eq!((colors.width(), colors.height()), (288, 217));
     // SCENE_PICTURE names a file to look at.

@@ -1,12 +1,20 @@
 //! How a scene is read.
 
+use std::path::PathBuf;
+
 use clap::{Args, ValueEnum};
-use planesweep_scene::{DepthLine, PixelCentre, ReadOptions};
+use planesweep_scene::{DepthLine, PixelCentre, ReadOptions, SceneFormat};
 
 /// What cannot be known from a scene's files.
 #[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Reading the scene")]
 pub struct ReadArgs {
+    /// The format of the scene; by default its files tell.
+    #[arg(long, value_enum)]
+    pub format: Option<FormatArg>,
+    /// The folder that image names count from; by default where the format has it.
+    #[arg(long, value_name = "FOLDER")]
+    pub images: Option<PathBuf>,
     /// Leave out views with an impossible camera, name or size instead of refusing the scene.
     #[arg(long)]
     pub skip_bad_views: bool,
@@ -20,6 +28,23 @@ pub struct ReadArgs {
     /// Factor on the depth interval of a cam.txt.
     #[arg(long)]
     pub interval_scale: Option<f64>,
+}
+
+/// [`SceneFormat`] on the command line.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum FormatArg {
+    /// A COLMAP model in sparse/ with its photographs, or a dense workspace.
+    Colmap,
+    /// A folder of MVSNet or BlendedMVS.
+    Mvsnet,
+    /// sfm_data.json of OpenMVG.
+    Openmvg,
+    /// transforms.json of nerfstudio or instant-ngp.
+    Nerfstudio,
+    /// bundle.out of Bundler with its list of images.
+    Bundler,
+    /// scene.mvs of OpenMVS.
+    Openmvs,
 }
 
 /// [`DepthLine`] on the command line.
@@ -46,6 +71,15 @@ impl ReadArgs {
     /// As the readers want it.
     pub fn options(&self) -> ReadOptions {
         ReadOptions {
+            format: self.format.map(|format| match format {
+                FormatArg::Colmap => SceneFormat::Colmap,
+                FormatArg::Mvsnet => SceneFormat::Mvsnet,
+                FormatArg::Openmvg => SceneFormat::OpenMvg,
+                FormatArg::Nerfstudio => SceneFormat::Nerfstudio,
+                FormatArg::Bundler => SceneFormat::Bundler,
+                FormatArg::Openmvs => SceneFormat::OpenMvs,
+            }),
+            images: self.images.clone(),
             skip_bad_views: self.skip_bad_views,
             depth_line: match self.depth_line {
                 DepthLineArg::Auto => DepthLine::Auto,

@@ -8,7 +8,7 @@ use clap::Args;
 use planesweep_mvsnet::{CpuBackend, DepthBackend, InferInput, TorchBackend, Weights};
 use planesweep_plan::{Plan, ViewPlan, plan, working_size};
 use planesweep_report::plot_probability;
-use planesweep_scene::{DepthMap, Raster, Scene, ViewId, WorkingImage, read_image};
+use planesweep_scene::{DepthMap, Raster, Scene, ViewId, WorkingImage, read_image, undistorted_intrinsics};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
@@ -127,7 +127,7 @@ fn find<'a>(scene: &Scene, plan: &'a Plan, wanted: &str) -> Result<&'a ViewPlan>
 
 fn working_image(scene: &Scene, plan: &Plan, id: ViewId) -> Result<WorkingImage> {
     let view = &scene.views[&id];
-    let size = &view.camera.intrinsics;
+    let size = undistorted_intrinsics(&view.camera.intrinsics, &view.distortion);
     let (width, height) = working_size(size.width, size.height, plan.options.max_size);
     let pixels = read_image(&view.image)?;
     WorkingImage::prepare(pixels, &view.camera, &view.distortion, width, height)

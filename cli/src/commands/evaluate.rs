@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use clap::{Args, Subcommand};
 use planesweep_evaluate::{DepthErrorOptions, DepthErrors, ErrorSummary, depth_error, truth_at_estimate};
-use planesweep_scene::{read_depth_pfm, read_pfm};
+use planesweep_scene::{read_depth_pfm, read_pfm, undistorted_intrinsics};
 use rayon::prelude::*;
 use serde_json::json;
 
@@ -112,7 +112,9 @@ fn measure(args: &EvaluateDepthArgs, view: &RecordedView) -> Result<Option<(Stri
     let estimate = read_depth_pfm(&map_file("depth"))?;
     let confidence = read_pfm(&map_file("confidence"))?;
     let (width, height) = (truth.width() as u32, truth.height() as u32);
-    let truth_camera = view.image_camera.intrinsics.resized(width, height);
+    // Depth maps have no lens, so the true one belongs to the undistorted photograph.
+    let undistorted = undistorted_intrinsics(&view.image_camera.intrinsics, &view.distortion);
+    let truth_camera = undistorted.resized(width, height);
     let context = || format!("cannot compare view {}", view.name);
     let truth =
         truth_at_estimate(&truth, &truth_camera, &view.depth_camera.intrinsics).with_context(context)?;

@@ -6,7 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use planesweep_mvsnet::InferCost;
 use planesweep_plan::{Plan, RangeOrigin, ViewPlan, plan};
-use planesweep_scene::{Distortion, Sampling, Scene};
+use planesweep_scene::{Sampling, Scene};
 use serde_json::json;
 
 use crate::args::{FilterArgs, PlanArgs, ReadArgs};
@@ -90,12 +90,7 @@ fn row(scene: &Scene, plan: &ViewPlan) -> Vec<String> {
     vec![
         view.name.clone(),
         format!("{}x{}", size.width, size.height),
-        match view.distortion {
-            Distortion::None => "pinhole",
-            Distortion::Radial { .. } => "radial",
-            Distortion::OpenCv { .. } => "opencv",
-        }
-        .to_owned(),
+        view.distortion.model().to_owned(),
         match plan.bands.len() {
             0 => format!("{}x{}", plan.working_size.0, plan.working_size.1),
             bands => format!("{}x{} in {bands} bands", plan.working_size.0, plan.working_size.1),

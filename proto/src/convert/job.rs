@@ -273,6 +273,18 @@ impl From<Distortion> for wire::Distortion {
                 Distortion::OpenCv { k1, k2, p1, p2 } => {
                     Some(Model::Opencv(wire::OpenCvDistortion { k1, k2, p1, p2 }))
                 }
+                Distortion::FullOpenCv { k1, k2, p1, p2, k3, k4, k5, k6 } => {
+                    let lens = wire::FullOpenCvDistortion { k1, k2, p1, p2, k3, k4, k5, k6 };
+                    Some(Model::FullOpencv(lens))
+                }
+                Distortion::Fov { omega } => Some(Model::Fov(wire::FovDistortion { omega })),
+                Distortion::Fisheye { k1, k2, k3, k4 } => {
+                    Some(Model::Fisheye(wire::FisheyeDistortion { k1, k2, k3, k4 }))
+                }
+                Distortion::ThinPrismFisheye { k1, k2, p1, p2, k3, k4, sx1, sy1 } => {
+                    let lens = wire::ThinPrismFisheyeDistortion { k1, k2, p1, p2, k3, k4, sx1, sy1 };
+                    Some(Model::ThinPrismFisheye(lens))
+                }
             },
         }
     }
@@ -283,16 +295,25 @@ impl TryFrom<wire::Distortion> for Distortion {
 
     fn try_from(distortion: wire::Distortion) -> Result<Self, WireError> {
         use wire::distortion::Model;
-        Ok(match distortion.model {
+        let distortion = match distortion.model {
             None => Self::None,
-            Some(Model::Radial(d)) => Self::Radial { k1: finite("k1", d.k1)?, k2: finite("k2", d.k2)? },
-            Some(Model::Opencv(d)) => Self::OpenCv {
-                k1: finite("k1", d.k1)?,
-                k2: finite("k2", d.k2)?,
-                p1: finite("p1", d.p1)?,
-                p2: finite("p2", d.p2)?,
-            },
-        })
+            Some(Model::Radial(d)) => Self::Radial { k1: d.k1, k2: d.k2 },
+            Some(Model::Opencv(d)) => Self::OpenCv { k1: d.k1, k2: d.k2, p1: d.p1, p2: d.p2 },
+            Some(Model::FullOpencv(d)) => {
+                let wire::FullOpenCvDistortion { k1, k2, p1, p2, k3, k4, k5, k6 } = d;
+                Self::FullOpenCv { k1, k2, p1, p2, k3, k4, k5, k6 }
+            }
+            Some(Model::Fov(d)) => Self::Fov { omega: d.omega },
+            Some(Model::Fisheye(d)) => Self::Fisheye { k1: d.k1, k2: d.k2, k3: d.k3, k4: d.k4 },
+            Some(Model::ThinPrismFisheye(d)) => {
+                let wire::ThinPrismFisheyeDistortion { k1, k2, p1, p2, k3, k4, sx1, sy1 } = d;
+                Self::ThinPrismFisheye { k1, k2, p1, p2, k3, k4, sx1, sy1 }
+            }
+        };
+        for coefficient in distortion.coefficients() {
+            finite("distortion coefficient", coefficient)?;
+        }
+        Ok(distortion)
     }
 }
 
@@ -360,16 +381,17 @@ mod tests {
     }
 
     fn distortion() -> impl Strategy<Value = Distortion> {
-        prop_oneof![
-            Just(Distortion::None),
-            (-1.0..1.0, -1.0..1.0).prop_map(|(k1, k2)| Distortion::Radial { k1, k2 }),
-            [-1.0..1.0, -1.0..1.0, -1.0..1.0, -1.0..1.0].prop_map(|[k1, k2, p1, p2]| Distortion::OpenCv {
-                k1,
-                k2,
-                p1,
-                p2
-            }),
-        ]
+        (0..7, proptest::array::uniform8(-1.0..1.0)).prop_map(|(model, [k1, k2, p1, p2, a, b, c, d])| {
+            match model {
+                0 => Distortion::None,
+                1 => Distortion::Radial { k1, k2 },
+                2 => Distortion::OpenCv { k1, k2, p1, p2 },
+                3 => Distortion::FullOpenCv { k1, k2, p1, p2, k3: a, k4: b, k5: c, k6: d },
+                4 => Distortion::Fov { omega: k1 },
+                5 => Distortion::Fisheye { k1, k2, k3: a, k4: b },
+                _ => Distortion::ThinPrismFisheye { k1, k2, p1, p2, k3: a, k4: b, sx1: c, sy1: d },
+            }
+        })
     }
 
     fn image() -> impl Strategy<Value = ImageSpec> {
@@ -521,6 +543,9 @@ mod tests {
         assert!(refused(|i| i.working_width = 0).starts_with("working width is 0"));
         let nan = wire::RadialDistortion { k1: f64::NAN, k2: 0.0 };
         let nan = wire::Distortion { model: Some(wire::distortion::Model::Radial(nan)) };
-        assert_eq!(refused(|i| i.distortion = Some(nan)), "k1 is NaN, which is not finite");
+        assert_eq!(
+            refused(|i| i.distortion = Some(nan)),
+            "distortion coefficient is NaN, which is not finite"
+        );
     }
 }

@@ -3,15 +3,16 @@
 use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
 
-use nalgebra::{Matrix3, Point3, Quaternion, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 
+use super::points::PointsInto;
 use super::views::{Candidate, Geometry, admit};
-use super::{ReadError, ReadOptions, ViewError, colmap_binary, colmap_text, read_bytes, read_text};
+use super::{ReadError, ReadOptions, ViewError, colmap_binary, colmap_text, inconsistent, read_text};
 use crate::{CameraError, Distortion, Intrinsics, Pose, Scene, ViewId};
 
 /// COLMAP's camera models; a model's number in binary files is its place here. All are known, so
 /// that files parse; [`lens`] says which can be used.
-const MODELS: [CameraModel; 11] = [
+const MODELS: [CameraModel; 18] = [
     CameraModel { name: "SIMPLE_PINHOLE", params: 3 },
     CameraModel { name: "PINHOLE", params: 4 },
     CameraModel { name: "SIMPLE_RADIAL", params: 4 },
@@ -23,6 +24,13 @@ const MODELS: [CameraModel; 11] = [
     CameraModel { name: "SIMPLE_RADIAL_FISHEYE", params: 4 },
     CameraModel { name: "RADIAL_FISHEYE", params: 5 },
     CameraModel { name: "THIN_PRISM_FISHEYE", params: 12 },
+    CameraModel { name: "RAD_TAN_THIN_PRISM_FISHEYE", params: 16 },
+    CameraModel { name: "SIMPLE_DIVISION", params: 4 },
+    CameraModel { name: "DIVISION", params: 5 },
+    CameraModel { name: "SIMPLE_FISHEYE", params: 3 },
+    CameraModel { name: "FISHEYE", params: 4 },
+    CameraModel { name: "EUCM", params: 6 },
+    CameraModel { name: "EQUIRECTANGULAR", params: 2 },
 ];
 
 /// The name of a camera model and how many parameters it has.
@@ -74,7 +82,7 @@ fn is_binary(model: &Path) -> bool {
 }
 
 pub(super) fn read(root: &Path, model: &Path, options: &ReadOptions) -> Result<Scene, ReadError> {
-    let image_folder = root.join("images");
+    let image_folder = options.images.clone().unwrap_or_else(|| root.join("images"));
     if !image_folder.is_dir() {
         return Err(ReadError::NoImages { model: model.to_owned(), images: image_folder });
     }
@@ -86,24 +94,15 @@ pub(super) fn read(root: &Path, model: &Path, options: &ReadOptions) -> Result<S
     let file = |stem: &str| model.join(format!("{stem}.{}", if binary { "bin" } else { "txt" }));
 
     let path = file("cameras");
-    let cameras = if binary {
-        colmap_binary::cameras(&path, &read_bytes(&path)?)?
-    } else {
-        colmap_text::cameras(&path, &read_text(&path)?)?
-    };
-    let cameras = by_id(cameras, |camera| camera.id, |id| inconsistent(&path, format!("camera {id} twice")))?;
+    let cameras =
+        if binary { colmap_binary::cameras(&path) } else { colmap_text::cameras(&path, &read_text(&path)?) };
+    let cameras =
+        by_id(cameras?, |camera| camera.id, |id| inconsistent(&path, format!("camera {id} twice")))?;
 
     let path = file("images");
-    let images = if binary {
-        colmap_binary::images(&path, &read_bytes(&path)?)?
-    } else {
-        colmap_text::images(&path, &read_text(&path)?)?
-    };
-    let images = by_id(images, |image| image.id, |id| inconsistent(&path, format!("image {id} twice")))?;
-    let mut names = HashSet::new();
-    if let Some(image) = images.values().find(|image| !names.insert(&image.name)) {
-        return Err(inconsistent(&path, format!("two images with the name {:?}", image.name)));
-    }
+    let images =
+        if binary { colmap_binary::images(&path) } else { colmap_text::images(&path, &read_text(&path)?) };
+    let images = by_id(images?, |image| image.id, |id| inconsistent(&path, format!("image {id} twice")))?;
     let ids: HashSet<u32> = images.keys().copied().collect();
     let candidates: Vec<_> = images
         .into_values()
@@ -115,35 +114,21 @@ pub(super) fn read(root: &Path, model: &Path, options: &ReadOptions) -> Result<S
             )),
         })
         .collect::<Result<_, _>>()?;
-    admit(candidates, &image_folder, options, &mut scene)?;
+    admit(candidates, &path, &image_folder, options, &mut scene)?;
 
     let path = file("points3D");
     if !path.is_file() {
         scene.warnings.push(format!("{} is missing: there are no sparse points", path.display()));
         return Ok(scene);
     }
-    let Scene { views, points, warnings, .. } = &mut scene;
-    let mut not_finite = 0;
-    let push = |position: Point3<f64>, track: &mut dyn Iterator<Item = u32>| {
-        if position.iter().all(|v| v.is_finite()) {
-            points.push(position, track.map(ViewId).filter(|id| views.contains_key(id)));
-        } else {
-            not_finite += 1;
-        }
-    };
+    let mut points = PointsInto::new(&mut scene);
     if binary {
-        colmap_binary::points(&path, &read_bytes(&path)?, &ids, push)?;
+        colmap_binary::points(&path, &ids, &mut points)?;
     } else {
-        colmap_text::points(&path, &read_text(&path)?, &ids, push)?;
+        colmap_text::points(&path, &read_text(&path)?, &ids, &mut points)?;
     }
-    if not_finite > 0 {
-        warnings.push(format!("{not_finite} sparse points are not finite and were left out"));
-    }
+    points.finish();
     Ok(scene)
-}
-
-fn inconsistent(path: &Path, what: String) -> ReadError {
-    ReadError::Inconsistent { path: path.to_owned(), what }
 }
 
 fn by_id<T>(
@@ -180,6 +165,7 @@ fn geometry(image: &RawImage, camera: &RawCamera) -> Result<Geometry, ViewError>
 
 /// Focal lengths, principal point and distortion, for the models that are supported.
 fn lens(camera: &RawCamera) -> Result<(f64, f64, f64, f64, Distortion), ViewError> {
+    let fisheye = |k1, k2, k3, k4| Distortion::Fisheye { k1, k2, k3, k4 };
     match (camera.model.name, camera.params.as_slice()) {
         ("SIMPLE_PINHOLE", &[f, cx, cy]) => Ok((f, f, cx, cy, Distortion::None)),
         ("PINHOLE", &[fx, fy, cx, cy]) => Ok((fx, fy, cx, cy, Distortion::None)),
@@ -188,7 +174,22 @@ fn lens(camera: &RawCamera) -> Result<(f64, f64, f64, f64, Distortion), ViewErro
         ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
             Ok((fx, fy, cx, cy, Distortion::OpenCv { k1, k2, p1, p2 }))
         }
-        (model, _) => Err(ViewError::UnsupportedModel { model }),
+        ("FULL_OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6]) => {
+            Ok((fx, fy, cx, cy, Distortion::FullOpenCv { k1, k2, p1, p2, k3, k4, k5, k6 }))
+        }
+        ("FOV", &[fx, fy, cx, cy, omega]) => Ok((fx, fy, cx, cy, Distortion::Fov { omega })),
+        ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
+            Ok((fx, fy, cx, cy, fisheye(k1, k2, k3, k4)))
+        }
+        ("SIMPLE_FISHEYE", &[f, cx, cy]) => Ok((f, f, cx, cy, fisheye(0.0, 0.0, 0.0, 0.0))),
+        ("FISHEYE", &[fx, fy, cx, cy]) => Ok((fx, fy, cx, cy, fisheye(0.0, 0.0, 0.0, 0.0))),
+        ("SIMPLE_RADIAL_FISHEYE", &[f, cx, cy, k1]) => Ok((f, f, cx, cy, fisheye(k1, 0.0, 0.0, 0.0))),
+        ("RADIAL_FISHEYE", &[f, cx, cy, k1, k2]) => Ok((f, f, cx, cy, fisheye(k1, k2, 0.0, 0.0))),
+        ("THIN_PRISM_FISHEYE", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, sx1, sy1]) => {
+            let lens = Distortion::ThinPrismFisheye { k1, k2, p1, p2, k3, k4, sx1, sy1 };
+            Ok((fx, fy, cx, cy, lens))
+        }
+        (model, _) => Err(ViewError::UnsupportedModel { model: model.to_owned() }),
     }
 }
 

@@ -4,10 +4,9 @@ use std::collections::HashSet;
 use std::path::Path;
 use std::str::FromStr;
 
-use nalgebra::Point3;
-
 use super::ReadError;
 use super::colmap::{CameraModel, RawCamera, RawImage};
+use super::points::PointsInto;
 
 /// One line, taken apart from the left.
 struct Line<'a> {
@@ -92,13 +91,12 @@ pub(super) fn images(path: &Path, text: &str) -> Result<Vec<RawImage>, ReadError
     Ok(images)
 }
 
-/// Hands each point with the ids of the images that see it to `push`. An id that is not in `images`
-/// is an error.
+/// Reads each point with the ids of the images that see it. An id that is not in `images` is an error.
 pub(super) fn points(
     path: &Path,
     text: &str,
     images: &HashSet<u32>,
-    mut push: impl FnMut(Point3<f64>, &mut dyn Iterator<Item = u32>),
+    points: &mut PointsInto,
 ) -> Result<(), ReadError> {
     let mut track = Vec::new();
     for mut line in lines(path, text).filter(is_record) {
@@ -114,7 +112,7 @@ pub(super) fn points(
             }
             track.push(image);
         }
-        push(position.into(), &mut track.iter().copied());
+        points.push(position, track.iter().copied());
     }
     Ok(())
 }

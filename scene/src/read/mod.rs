@@ -1,11 +1,19 @@
 //! Readers of the field's formats, all into a [`Scene`].
 
+mod bundler;
+mod bytes;
 mod colmap;
 mod colmap_binary;
 mod colmap_text;
+mod detect;
+mod json;
 mod mvsnet;
 mod names;
+mod nerfstudio;
+mod openmvg;
+mod openmvs;
 mod pairs;
+mod points;
 mod views;
 
 use std::fs;
@@ -14,6 +22,7 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
+pub use detect::SceneFormat;
 pub use names::{NameError, ResolveError, resolve_inside, safe_name};
 
 use crate::{CameraError, Scene, SizeMismatch};
@@ -21,6 +30,10 @@ use crate::{CameraError, Scene, SizeMismatch};
 /// What a reader cannot know from the files.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ReadOptions {
+    /// The format; when not given it is told by the files.
+    pub format: Option<SceneFormat>,
+    /// The folder that image names count from; when not given, where the format has it.
+    pub images: Option<PathBuf>,
     /// Leave out views with an impossible camera, name or size, with a warning, instead of refusing
     /// the scene.
     pub skip_bad_views: bool,
@@ -38,6 +51,8 @@ pub struct ReadOptions {
 impl Default for ReadOptions {
     fn default() -> Self {
         Self {
+            format: None,
+            images: None,
             skip_bad_views: false,
             depth_line: DepthLine::Auto,
             pixel_centre: PixelCentre::Integer,
@@ -70,17 +85,27 @@ pub enum PixelCentre {
 /// Why a scene could not be read.
 #[derive(Debug, Error)]
 pub enum ReadError {
-    /// The folder has no layout that is known.
+    /// The path holds nothing that is known.
     #[error(
-        "found no scene in {}: a COLMAP scene has images/ and a model in sparse/ or sparse/0/, an MVSNet folder cams/ and images/ or blended_images/",
+        "found no scene in {}: a COLMAP scene has images/ and a model in sparse/ or sparse/0/, an MVSNet folder cams/ and images/ or blended_images/, others a file sfm_data.json, transforms.json, bundle.out or scene.mvs",
         path.display()
     )]
     NoScene {
-        /// The folder.
+        /// The folder or file.
         path: PathBuf,
     },
+    /// The path does not hold what the user says it holds.
+    #[error("found no {format} scene in {}: there is no {looked_for}", path.display())]
+    NotThisFormat {
+        /// The folder or file.
+        path: PathBuf,
+        /// What the user asked for.
+        format: SceneFormat,
+        /// What such a scene has.
+        looked_for: &'static str,
+    },
     /// There is a model, but no folder with its photographs.
-    #[error("found {}, but no folder {}", model.display(), images.display())]
+    #[error("found {}, but no folder {}; --images names the one with the photographs", model.display(), images.display())]
     NoImages {
         /// The model or the folder of cameras.
         model: PathBuf,
@@ -102,7 +127,7 @@ pub enum ReadError {
         /// The file.
         path: PathBuf,
         /// Where.
-        offset: usize,
+        offset: u64,
         /// What is wrong there.
         what: String,
     },
@@ -142,7 +167,7 @@ pub enum ReadError {
 }
 
 /// Why a view cannot be used.
-#[derive(Debug, Error, PartialEq)]
+#[derive(Clone, Debug, Error, PartialEq)]
 pub enum ViewError {
     /// Its camera is impossible.
     #[error(transparent)]
@@ -156,8 +181,8 @@ pub enum ViewError {
     /// Its lens follows a model that is not supported.
     #[error("camera model {model} is not supported")]
     UnsupportedModel {
-        /// The model's name in COLMAP.
-        model: &'static str,
+        /// The model's name in its format.
+        model: String,
     },
     /// Its camera file breaks the format.
     #[error("its camera file {} {what}", path.display())]
@@ -169,22 +194,33 @@ pub enum ViewError {
     },
 }
 
-/// Reads the scene in a folder, whatever of the known layouts it has.
+/// Reads a scene: a folder in one of the known layouts, or the file that describes it.
 ///
 /// Views whose image is missing or has no readable header are left out with a warning; their ids
 /// vanish from tracks and pairs too.
-pub fn read_scene(root: &Path, options: &ReadOptions) -> Result<Scene, ReadError> {
-    let scene = if let Some(sparse) = colmap::find_model(root) {
-        colmap::read(root, &sparse, options)?
-    } else if mvsnet::is_scene(root) {
-        mvsnet::read(root, options)?
-    } else {
-        return Err(ReadError::NoScene { path: root.to_owned() });
+pub fn read_scene(path: &Path, options: &ReadOptions) -> Result<Scene, ReadError> {
+    let found = detect::find(path, options.format)?;
+    let scene = match found.format {
+        SceneFormat::Colmap => colmap::read(path, &found.path, options)?,
+        SceneFormat::Mvsnet => mvsnet::read(&found.path, options)?,
+        SceneFormat::OpenMvg => openmvg::read(&found.path, options)?,
+        SceneFormat::Nerfstudio => nerfstudio::read(&found.path, options)?,
+        SceneFormat::Bundler => bundler::read(&found.path, options)?,
+        SceneFormat::OpenMvs => openmvs::read(&found.path, options)?,
     };
     if scene.views.is_empty() {
-        return Err(ReadError::NoViews { path: root.to_owned() });
+        return Err(ReadError::NoViews { path: path.to_owned() });
     }
     Ok(scene)
+}
+
+fn inconsistent(path: &Path, what: String) -> ReadError {
+    ReadError::Inconsistent { path: path.to_owned(), what }
+}
+
+/// A path of a foreign file as a name: without `./` at its start and slashes at its end.
+fn relative_name(path: &str) -> String {
+    path.trim_start_matches("./").trim_end_matches('/').to_owned()
 }
 
 fn read_bytes(path: &Path) -> Result<Vec<u8>, ReadError> {

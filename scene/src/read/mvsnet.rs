@@ -27,7 +27,10 @@ pub(super) fn is_scene(root: &Path) -> bool {
 
 pub(super) fn read(root: &Path, options: &ReadOptions) -> Result<Scene, ReadError> {
     let cams = root.join("cams");
-    let images = IMAGE_FOLDERS.map(|name| root.join(name));
+    let images = match &options.images {
+        Some(folder) => vec![folder.clone()],
+        None => IMAGE_FOLDERS.map(|name| root.join(name)).to_vec(),
+    };
     let images = images
         .iter()
         .find(|folder| folder.is_dir())
@@ -50,7 +53,7 @@ pub(super) fn read(root: &Path, options: &ReadOptions) -> Result<Scene, ReadErro
         let name = image_names.get(&id).cloned().unwrap_or_else(|| file.replace("_cam.txt", ".jpg"));
         candidates.push(Candidate { id: ViewId(id), name, geometry });
     }
-    admit(candidates, images, options, &mut scene)?;
+    admit(candidates, &cams, images, options, &mut scene)?;
     let pair_path = root.join("pair.txt");
     if pair_path.is_file() {
         let Scene { views, pairs, warnings, .. } = &mut scene;

@@ -142,7 +142,7 @@ mod tests {
         let pairs = pairs.expect("a good file");
         assert_eq!(ids(&pairs, 4), [1, 0]);
         assert_eq!(pairs[&ViewId(4)][0].score, 9.5);
-        assert_eq!(ids(&pairs, 1), []);
+        assert!(ids(&pairs, 1).is_empty());
         assert!(warnings.is_empty());
     }
 

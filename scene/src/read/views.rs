@@ -1,11 +1,12 @@
 //! From what a format says of a view to a view with its image.
 
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
 use super::names::{ResolveError, resolve_inside};
-use super::{ReadError, ReadOptions, ViewError};
+use super::{ReadError, ReadOptions, ViewError, inconsistent};
 use crate::{
     Camera, DepthRange, Distortion, Intrinsics, Pose, Scene, View, ViewId, fit_to_image, image_size,
 };
@@ -39,14 +40,19 @@ impl<E: Into<ViewError>> From<E> for Refusal {
     }
 }
 
-/// Adds the candidates that hold to the scene, with warnings for the others. `names` of candidates
-/// are relative to `images`.
+/// Adds the candidates that hold to the scene, with warnings for the others. Names of candidates
+/// are relative to `images`; two with the same name are refused as a contradiction of `file`.
 pub(super) fn admit(
     candidates: Vec<Candidate>,
+    file: &Path,
     images: &Path,
     options: &ReadOptions,
     scene: &mut Scene,
 ) -> Result<(), ReadError> {
+    let mut names = HashSet::new();
+    if let Some(candidate) = candidates.iter().find(|candidate| !names.insert(&candidate.name)) {
+        return Err(inconsistent(file, format!("two images with the name {:?}", candidate.name)));
+    }
     // Headers of many images: the time is that of the disk, so threads help.
     let examined: Vec<_> = candidates
         .into_par_iter()

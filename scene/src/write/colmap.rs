@@ -13,7 +13,7 @@ type CameraRecord = (u32, u32, u32, Vec<u64>);
 
 /// Writes `sparse/cameras.bin`, `images.bin` and `points3D.bin` below `root`; images are not copied.
 ///
-/// Views with equal intrinsics share a camera: PINHOLE, or RADIAL or OPENCV where the lens distorts.
+/// Views with equal intrinsics share a camera: PINHOLE, or the model of the lens.
 /// A point becomes an observation where the camera sees it. Skew, depth ranges and pairs have no
 /// place in the format: skew is refused, the others are left out. Colours are not known: grey.
 pub fn write_colmap(scene: &Scene, root: &Path) -> Result<(), WriteError> {
@@ -39,12 +39,20 @@ fn camera_record(view: &View) -> Result<CameraRecord, WriteError> {
     }
     // COLMAP puts the top-left pixel's centre at (0.5, 0.5).
     let (cx, cy) = (cx + 0.5, cy + 0.5);
-    let (model, params) = match view.distortion {
-        Distortion::None => (1, vec![fx, fy, cx, cy]),
-        Distortion::Radial { k1, k2 } if fx == fy => (3, vec![fx, cx, cy, k1, k2]),
-        Distortion::Radial { k1, k2 } => (4, vec![fx, fy, cx, cy, k1, k2, 0.0, 0.0]),
-        Distortion::OpenCv { k1, k2, p1, p2 } => (4, vec![fx, fy, cx, cy, k1, k2, p1, p2]),
+    let model = match view.distortion {
+        Distortion::None => 1,
+        Distortion::Radial { .. } if fx == fy => 3,
+        Distortion::Radial { .. } | Distortion::OpenCv { .. } => 4,
+        Distortion::Fisheye { .. } => 5,
+        Distortion::FullOpenCv { .. } => 6,
+        Distortion::Fov { .. } => 7,
+        Distortion::ThinPrismFisheye { .. } => 10,
     };
+    let mut params = if model == 3 { vec![fx, cx, cy] } else { vec![fx, fy, cx, cy] };
+    params.extend(view.distortion.coefficients());
+    if matches!(view.distortion, Distortion::Radial { .. }) && model == 4 {
+        params.extend([0.0, 0.0]);
+    }
     Ok((model, width, height, params.into_iter().map(f64::to_bits).collect()))
 }
 
