@@ -1,5 +1,5 @@
 //! Training samples to look at: `cargo run -p planesweep-synth --example contact_sheet -- OUT.png
-//! FIRST_SEED COUNT [SETTING]` writes one row per sample: its views, then depth within its range (near
+//! FIRST_SEED COUNT [SETTING or any] [FOLDER...]` writes one row per sample: its views, then depth within its range (near
 //! is bright, unknown is blue), two samples side by side.
 
 use std::error::Error;
@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use image::{Rgb, RgbImage};
 use planesweep_scene::TrainingSample;
-use planesweep_synth::{TrainingOptions, training_sample};
+use planesweep_synth::{Library, TrainingOptions, training_sample_with};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = std::env::args().skip(1);
@@ -15,14 +15,19 @@ fn main() -> Result<(), Box<dyn Error>> {
     let out = next().ok_or("the PNG to write is missing")?;
     let first: u64 = next().map_or(Ok(0), |text| text.parse())?;
     let count: u64 = next().map_or(Ok(12), |text| text.parse())?;
-    let setting = next().map(|name| serde_json::from_value(serde_json::Value::String(name))).transpose()?;
+    let setting = next().filter(|name| name != "any");
+    let setting = setting.map(|name| serde_json::from_value(name.into())).transpose()?;
+    let mut library = Library::default();
+    while let Some(folder) = next() {
+        library.add_folder(folder.as_ref())?;
+    }
     let options = TrainingOptions { setting, ..TrainingOptions::default() };
     let (width, height) = (options.width, options.height);
     let columns = options.views as u32 + 1;
     let mut sheet = RgbImage::new(2 * columns * width, count.div_ceil(2) as u32 * height);
     let start = Instant::now();
     for i in 0..count {
-        let sample = training_sample(first + i, &options);
+        let sample = training_sample_with(first + i, &options, &library);
         let (left, top) = ((i % 2) as u32 * columns * width, (i / 2) as u32 * height);
         for (k, view) in sample.views.iter().enumerate() {
             draw(&mut sheet, left + k as u32 * width, top, width, height, |x, y| view.pixels.at(x, y));

@@ -10,6 +10,7 @@ mod camera_path;
 mod courtyard;
 mod demo;
 mod geometry;
+mod mesh_file;
 mod noise;
 mod render;
 mod scene;
@@ -19,5 +20,6 @@ mod texture;
 mod training;
 
 pub use demo::{DemoError, DemoOptions, write_demo};
+pub use mesh_file::{MeshError, is_mesh, read_mesh};
 pub use scene::{Style, SynthScene};
-pub use training::{Setting, TrainingOptions, training_sample};
+pub use training::{Library, LibraryError, Setting, TrainingOptions, training_sample, training_sample_with};

@@ -1,16 +1,19 @@
-//! A bounding volume hierarchy over few bodies: median splits, built once per scene.
+//! A bounding volume hierarchy: median splits, built once over the bodies of a scene or the triangles of
+//! a mesh.
 
 use nalgebra::{Point3, Vector3};
 
 use super::{Bounds, Span};
 
 /// Deep enough for any count: halves are even, so the depth is the logarithm of the count.
-const MAX_DEPTH: usize = 32;
+const MAX_DEPTH: usize = 40;
 
 /// A binary tree of boxes, stored depth first: the left child follows its parent.
 #[derive(Clone, Debug)]
 pub struct Bvh {
     nodes: Vec<Node>,
+    /// The items of all leaves; those of one stand together.
+    order: Vec<u32>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -21,23 +24,34 @@ struct Node {
 
 #[derive(Clone, Copy, Debug)]
 enum Kind {
-    Leaf { body: usize },
-    Split { right: usize },
+    /// Its items are `order[first..last]`.
+    Leaf {
+        first: u32,
+        last: u32,
+    },
+    Split {
+        right: u32,
+    },
 }
 
 impl Bvh {
-    /// Builds the tree; the index of a box is the body's.
-    pub fn new(bounds: &[Bounds]) -> Self {
-        let mut nodes = Vec::with_capacity(2 * bounds.len());
-        let mut order: Vec<usize> = (0..bounds.len()).collect();
+    /// Builds the tree with up to `leaf_size` items per leaf; the index of a box is the item's.
+    pub fn new(bounds: &[Bounds], leaf_size: usize) -> Self {
+        let mut nodes = Vec::with_capacity(2 * bounds.len().div_ceil(leaf_size));
+        let mut order: Vec<u32> = (0..bounds.len() as u32).collect();
         if !order.is_empty() {
-            build(bounds, &mut order, &mut nodes);
+            build(bounds, &mut order, 0, leaf_size, &mut nodes);
         }
-        Self { nodes }
+        Self { nodes, order }
     }
 
-    /// Calls `visit(body, max)` for every body whose box the ray crosses before `max`, near boxes
-    /// first; it returns the `max` from there on, or `None` to stop.
+    /// A box that holds all items; `None` when there are none.
+    pub fn bounds(&self) -> Option<Bounds> {
+        self.nodes.first().map(|node| node.bounds)
+    }
+
+    /// Calls `visit(item, max)` for every item in a leaf whose box the ray crosses before `max`, near
+    /// boxes first; it returns the `max` from there on, or `None` to stop.
     #[inline]
     pub fn visit(
         &self,
@@ -58,12 +72,16 @@ impl Bvh {
         loop {
             if near < span.max {
                 match self.nodes[current].kind {
-                    Kind::Leaf { body } => match visit(body, span.max) {
-                        Some(max) => span.max = max,
-                        None => return,
-                    },
+                    Kind::Leaf { first, last } => {
+                        for item in &self.order[first as usize..last as usize] {
+                            match visit(*item as usize, span.max) {
+                                Some(max) => span.max = max,
+                                None => return,
+                            }
+                        }
+                    }
                     Kind::Split { right } => {
-                        let left = current + 1;
+                        let (left, right) = (current + 1, right as usize);
                         match (enters(left, span), enters(right, span)) {
                             (Some(l), Some(r)) => {
                                 let (first, second) =
@@ -95,19 +113,23 @@ impl Bvh {
     }
 }
 
-fn build(bounds: &[Bounds], order: &mut [usize], nodes: &mut Vec<Node>) {
-    let all = order[1..].iter().fold(bounds[order[0]], |all, i| all.union(&bounds[*i]));
-    if let [body] = *order {
-        nodes.push(Node { bounds: all, kind: Kind::Leaf { body } });
+/// Builds the node of the items in `order`, which stand from `start` on in the whole.
+fn build(bounds: &[Bounds], order: &mut [u32], start: usize, leaf_size: usize, nodes: &mut Vec<Node>) {
+    let of = |item: &u32| &bounds[*item as usize];
+    let all = order[1..].iter().fold(*of(&order[0]), |all, item| all.union(of(item)));
+    if order.len() <= leaf_size {
+        let kind = Kind::Leaf { first: start as u32, last: (start + order.len()) as u32 };
+        nodes.push(Node { bounds: all, kind });
         return;
     }
     let axis = (all.max - all.min).iamax();
-    let middle = |i: usize| bounds[i].min[axis] + bounds[i].max[axis];
-    order.sort_by(|a, b| middle(*a).total_cmp(&middle(*b)).then(a.cmp(b)));
-    let (left, right) = order.split_at_mut(order.len() / 2);
+    let middle = |item: &u32| of(item).min[axis] + of(item).max[axis];
+    let half = order.len() / 2;
+    order.select_nth_unstable_by(half, |a, b| middle(a).total_cmp(&middle(b)).then(a.cmp(b)));
+    let (left, right) = order.split_at_mut(half);
     let at = nodes.len();
     nodes.push(Node { bounds: all, kind: Kind::Split { right: 0 } });
-    build(bounds, left, nodes);
-    nodes[at].kind = Kind::Split { right: nodes.len() };
-    build(bounds, right, nodes);
+    build(bounds, left, start, leaf_size, nodes);
+    nodes[at].kind = Kind::Split { right: nodes.len() as u32 };
+    build(bounds, right, start + half, leaf_size, nodes);
 }

@@ -2,11 +2,13 @@
 
 mod bvh;
 mod heightfield;
+mod mesh;
 mod shape;
 mod torus;
 mod world;
 
 pub use heightfield::Heightfield;
+pub use mesh::{MeshShape, TriangleMesh};
 pub use shape::Shape;
 pub use world::{Body, Hit, Placement, World};
 

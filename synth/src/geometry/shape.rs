@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use nalgebra::{Point3, Vector3};
 
-use super::{Bounds, Heightfield, Ray, Span, torus};
+use super::{Bounds, Heightfield, MeshShape, Ray, Span, torus};
 
 /// A surface in its local frame; lengths in scene units.
 #[derive(Clone, Debug)]
@@ -35,6 +35,8 @@ pub enum Shape {
     },
     /// A surface over the xy plane.
     Heightfield(Heightfield),
+    /// Triangles, shared by all bodies of one form.
+    Mesh(MeshShape),
 }
 
 impl Shape {
@@ -53,10 +55,12 @@ impl Shape {
             Self::Cylinder { radius, half_height } => intersect_cylinder(*radius, *half_height, ray, span),
             Self::Torus { major, minor } => torus::intersect(*major, *minor, ray, span),
             Self::Heightfield(field) => field.intersect(ray, span),
+            Self::Mesh(part) => part.intersect(ray, span),
         }
     }
 
-    /// The outward normal, of length 1, at a point of the surface.
+    /// The outward normal, of length 1, at a point of the surface. That of a mesh follows from the
+    /// ray instead, see [`MeshShape::surface`]; here it is from the middle outwards.
     pub fn normal(&self, point: &Point3<f64>) -> Vector3<f64> {
         match self {
             Self::Cuboid { half } => {
@@ -75,6 +79,7 @@ impl Shape {
             }
             Self::Torus { major, .. } => torus::normal(*major, point),
             Self::Heightfield(field) => field.normal(point.x, point.y),
+            Self::Mesh(_) => point.coords.try_normalize(0.0).unwrap_or_else(Vector3::z),
         }
     }
 
@@ -82,7 +87,7 @@ impl Shape {
     /// courses run along the first, and the second rises with local z where the surface does.
     pub fn surface_coordinates(&self, point: &Point3<f64>, normal: &Vector3<f64>) -> [f64; 2] {
         match self {
-            Self::Cuboid { .. } => match normal.iamax() {
+            Self::Cuboid { .. } | Self::Mesh(_) => match normal.iamax() {
                 0 => [point.y, point.z],
                 1 => [point.x, point.z],
                 _ => [point.x, point.y],
@@ -102,6 +107,7 @@ impl Shape {
     pub fn bounds(&self) -> Bounds {
         let half = match self {
             Self::Heightfield(field) => return field.bounds(),
+            Self::Mesh(part) => return part.bounds(),
             Self::Cuboid { half } => *half,
             Self::Ellipsoid { radii } => *radii,
             Self::Cylinder { radius, half_height } => Vector3::new(*radius, *radius, *half_height),
@@ -180,6 +186,7 @@ mod tests {
             Shape::Cylinder { radius, half_height } => (p.x.hypot(p.y) - radius).max(p.z.abs() - half_height),
             Shape::Torus { major, minor } => (p.x.hypot(p.y) - major).hypot(p.z) - minor,
             Shape::Heightfield(field) => p.z - field.height(p.x, p.y),
+            Shape::Mesh(_) => unreachable!("meshes are tested where they are"),
         }
     }
 

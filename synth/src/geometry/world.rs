@@ -74,7 +74,7 @@ impl World {
     /// Takes the bodies; their order gives their indices.
     pub fn new(bodies: Vec<Body>) -> Self {
         let bounds: Vec<_> = bodies.iter().map(Body::bounds).collect();
-        Self { bvh: Bvh::new(&bounds), bodies }
+        Self { bvh: Bvh::new(&bounds, 1), bodies }
     }
 
     /// The first `t` above 0 at which the ray meets a body, and which.
@@ -98,8 +98,13 @@ impl World {
         let body = &self.bodies[index];
         let point = ray.at(t);
         let local = body.placement.point_to_local(&point);
-        let normal = body.shape.normal(&local);
-        let along = body.shape.surface_coordinates(&local, &normal);
+        let (normal, along) = match &body.shape {
+            Shape::Mesh(part) => part.surface(&body.placement.to_local(ray), &local),
+            shape => {
+                let normal = shape.normal(&local);
+                (normal, shape.surface_coordinates(&local, &normal))
+            }
+        };
         Some(Hit { body: index, t, point, normal: body.placement.rotation * normal, local, along })
     }
 

@@ -56,7 +56,7 @@ impl Camera {
             saturation: rng.random_range(0.6..1.3),
             vignetting: if rng.random_bool(0.5) { rng.random_range(0.0..0.5) } else { 0.0 },
             noise: log_uniform(rng, 0.2, 6.0) as f32,
-            blur: if rng.random_bool(0.6) { rng.random_range(0.3..0.9) } else { 0.0 },
+            blur: if rng.random_bool(0.5) { rng.random_range(0.3..0.8) } else { 0.0 },
             quality: rng.random_bool(0.7).then(|| rng.random_range(55..=97)),
             drift,
         }
@@ -69,7 +69,7 @@ impl Camera {
         camera.balance = [self.balance[0] * vary(0.1), 1.0, self.balance[2] * vary(0.1)];
         camera.gamma *= vary(0.12);
         // A hand shakes and focus misses now and then.
-        let blur = if rng.random_bool(0.1) { rng.random_range(0.6..1.6) } else { 0.0 };
+        let blur = if rng.random_bool(0.08) { rng.random_range(0.5..1.4) } else { 0.0 };
         Development { camera, blur: self.blur.hypot(blur), seed: rng.random() }
     }
 }

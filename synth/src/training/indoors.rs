@@ -7,6 +7,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::draw::{direction, log_uniform, pick, rotation, yaw};
+use super::library::Library;
 use super::light::Light;
 use super::settings::{Frame, distance_for, field_of_view};
 use super::stage::{Builder, Motion, Shot, Stage};
@@ -15,10 +16,10 @@ use crate::geometry::{Heightfield, Shape};
 use crate::noise::octaves;
 
 /// Things on a table or the ground, from around: scans of objects.
-pub fn objects(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
+pub fn objects(rng: &mut ChaCha8Rng, library: &Library, frame: Frame) -> (Stage, Shot) {
     let field = field_of_view(rng);
     let distance = distance_for(2.4, field) * log_uniform(rng, 0.6, 1.5);
-    let mut builder = Builder::new(rng, frame.texel(distance, field));
+    let mut builder = Builder::new(rng, library, frame.texel(distance, field));
     add_ground(&mut builder, 1.0);
     add_backdrop(&mut builder, 1.6);
     let count = builder.rng.random_range(1..=14);
@@ -33,10 +34,10 @@ pub fn objects(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
 }
 
 /// Many bodies thrown on a heap, sticks among them.
-pub fn heap(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
+pub fn heap(rng: &mut ChaCha8Rng, library: &Library, frame: Frame) -> (Stage, Shot) {
     let field = field_of_view(rng);
     let distance = distance_for(2.0, field) * log_uniform(rng, 0.5, 1.4);
-    let mut builder = Builder::new(rng, frame.texel(distance, field));
+    let mut builder = Builder::new(rng, library, frame.texel(distance, field));
     add_ground(&mut builder, 1.0);
     add_backdrop(&mut builder, 1.8);
     let paints: Vec<_> = (0..builder.rng.random_range(3..25)).map(|_| builder.paint()).collect();
@@ -58,11 +59,11 @@ pub fn heap(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
 }
 
 /// A furnished room, from one side across.
-pub fn room(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
+pub fn room(rng: &mut ChaCha8Rng, library: &Library, frame: Frame) -> (Stage, Shot) {
     let field = rng.random_range(45.0..78.0);
     let half = [rng.random_range(1.6..4.5), rng.random_range(1.6..4.5)];
     let height = rng.random_range(2.3..3.4);
-    let mut builder = Builder::new(rng, frame.texel(1.2 * half[1], field));
+    let mut builder = Builder::new(rng, library, frame.texel(1.2 * half[1], field));
     add_shell(&mut builder, half, height);
     for _ in 0..builder.rng.random_range(4..14) {
         // Furniture stands along the walls rather than in the way.
@@ -99,11 +100,11 @@ pub fn room(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
 }
 
 /// A long way between walls with pillars and things, seen along it.
-pub fn corridor(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
+pub fn corridor(rng: &mut ChaCha8Rng, library: &Library, frame: Frame) -> (Stage, Shot) {
     let field = rng.random_range(50.0..80.0);
     let half = [rng.random_range(1.0..2.5), rng.random_range(5.0..14.0)];
     let height = rng.random_range(2.2..3.6);
-    let mut builder = Builder::new(rng, frame.texel(0.35 * half[1], field));
+    let mut builder = Builder::new(rng, library, frame.texel(0.35 * half[1], field));
     add_shell(&mut builder, half, height);
     let pillar = builder.paint();
     let spacing = builder.between(1.5, 3.5);
@@ -143,10 +144,10 @@ pub fn corridor(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
 }
 
 /// Shapes afloat before a wall: nothing here is real but the geometry.
-pub fn floating(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
+pub fn floating(rng: &mut ChaCha8Rng, library: &Library, frame: Frame) -> (Stage, Shot) {
     let field = field_of_view(rng);
     let distance = distance_for(2.2, field) * log_uniform(rng, 0.7, 1.3);
-    let mut builder = Builder::new(rng, frame.texel(distance, field));
+    let mut builder = Builder::new(rng, library, frame.texel(distance, field));
     let wall = builder.paint();
     let tilt = yaw(builder.between(-0.6, 0.6));
     let depth = builder.between(1.0, 3.0);

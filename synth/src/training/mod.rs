@@ -3,10 +3,13 @@
 mod draw;
 mod film;
 mod indoors;
+mod library;
 mod light;
 mod motif;
+mod moulded;
 mod outdoors;
 mod paint;
+mod photo;
 mod rig;
 mod settings;
 mod shoot;
@@ -20,6 +23,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
+pub use library::{Library, LibraryError};
 pub use settings::Setting;
 
 use self::rig::Rig;
@@ -47,6 +51,11 @@ impl Default for TrainingOptions {
 
 /// A scene is made anew up to this often until it serves.
 const ATTEMPTS: u64 = 16;
+/// At least this share of pixels must differ from a neighbour by [`DIFFERENCE`]: on less, nothing can be
+/// matched and nothing learnt.
+const WANTED_TEXTURE: f64 = 0.12;
+/// Share of the light.
+const DIFFERENCE: f32 = 0.04;
 /// At least this share of the depth map must be known.
 const WANTED_KNOWN: f64 = 0.35;
 
@@ -56,11 +65,17 @@ const WANTED_KNOWN: f64 = 0.35;
 /// Images have the size asked for, the depth map a quarter of it. Lengths are in arbitrary units,
 /// and other ones for each seed.
 pub fn training_sample(seed: u64, options: &TrainingOptions) -> TrainingSample {
+    training_sample_with(seed, options, &Library::default())
+}
+
+/// Like [`training_sample`], with the library's meshes and photographs among what is made up. Another
+/// library gives other samples for all seeds.
+pub fn training_sample_with(seed: u64, options: &TrainingOptions, library: &Library) -> TrainingSample {
     let mut best: Option<(f64, Draft)> = None;
     for attempt in 0..ATTEMPTS {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(attempt);
-        let Some(draft) = Draft::new(options, rng) else { continue };
+        let Some(draft) = Draft::new(options, library, rng) else { continue };
         let known = draft.depth.values().iter().filter(|d| **d > 0.0).count() as f64
             / draft.depth.values().len().max(1) as f64;
         if best.as_ref().is_none_or(|(most, _)| known > *most) {
@@ -73,7 +88,7 @@ pub fn training_sample(seed: u64, options: &TrainingOptions) -> TrainingSample {
     match best {
         Some((_, draft)) => draft.finish(),
         // Nothing served, as with images of a few pixels: another seed will.
-        None => training_sample(seed.wrapping_add(0x9e37_79b9_7f4a_7c15), options),
+        None => training_sample_with(seed.wrapping_add(0x9e37_79b9_7f4a_7c15), options, library),
     }
 }
 
@@ -87,10 +102,10 @@ struct Draft {
 }
 
 impl Draft {
-    fn new(options: &TrainingOptions, mut rng: ChaCha8Rng) -> Option<Self> {
+    fn new(options: &TrainingOptions, library: &Library, mut rng: ChaCha8Rng) -> Option<Self> {
         let TrainingOptions { width, height, views, setting } = *options;
         let setting = setting.unwrap_or_else(|| Setting::random(&mut rng));
-        let (stage, shot) = setting.build(&mut rng, Frame { width });
+        let (stage, shot) = setting.build(&mut rng, library, Frame { width });
         let Rig { cameras, overlap } =
             rig::place(&stage.world, &shot, width, height, views.max(2), &mut rng)?;
         if overlap < WANTED_KNOWN / 2.0 {
@@ -98,6 +113,9 @@ impl Draft {
         }
         let depth = truth::depth(&stage.world, &cameras);
         let range = truth::range(&depth, &mut rng)?;
+        if texture(&stage, &cameras[0]) < WANTED_TEXTURE {
+            return None;
+        }
         Some(Self { stage, cameras, depth, range, rng })
     }
 
@@ -120,6 +138,21 @@ impl Draft {
     }
 }
 
+/// The share of pixels of a view, at a quarter of its size, whose light differs from a neighbour's.
+fn texture(stage: &Stage, camera: &Camera) -> f64 {
+    let map = Camera { intrinsics: camera.intrinsics.quartered(), pose: camera.pose };
+    let light = shoot::light(stage, &map);
+    let differ = |a: [f32; 3], b: [f32; 3]| (a[1] - b[1]).abs() > DIFFERENCE * a[1].max(b[1]);
+    let pixels = (1..light.height()).flat_map(|y| (1..light.width()).map(move |x| (x, y)));
+    let count = pixels
+        .filter(|(x, y)| {
+            let here = light.at(*x, *y);
+            differ(here, light.at(x - 1, *y)) || differ(here, light.at(*x, y - 1))
+        })
+        .count();
+    count as f64 / light.values().len().max(1) as f64
+}
+
 /// The camera when all lengths are multiplied.
 fn scaled(camera: &Camera, unit: f64) -> Camera {
     let mut scaled = *camera;
@@ -140,7 +173,7 @@ mod tests {
         let drafts = (0..100).filter_map(|stream| {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             rng.set_stream(stream);
-            Draft::new(&SMALL, rng)
+            Draft::new(&SMALL, &Library::default(), rng)
         });
         drafts.into_iter().next().expect("a hundred scenes and none serves")
     }

@@ -1,10 +1,13 @@
 //! Motifs: the coarse structure of surfaces in training scenes, beside those of [`crate::texture`].
 
+use std::sync::Arc;
+
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::draw::{log_uniform, pick};
 use super::paint::resolved;
+use super::photo::Photo;
 use crate::noise::{Cell, cells, gradient_noise, hash, lerp, mix, octaves, smoothstep, unit};
 use crate::texture::{Material, Pattern, Rgb, Spot};
 
@@ -21,6 +24,8 @@ pub struct Layer {
     palette: [Rgb; 3],
     mean: Rgb,
     seed: u32,
+    /// What the motif [`Motif::Photo`] shows.
+    photo: Option<Arc<Photo>>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -59,11 +64,17 @@ enum Motif {
     Rings,
     /// Short strokes of grass or fur.
     Strokes,
+    /// A photograph, side by side with its mirror images.
+    Photo,
 }
 
 impl Layer {
-    /// Any motif in any colours.
-    pub fn random(rng: &mut ChaCha8Rng, texel: f64) -> Self {
+    /// Any motif in any colours, or one of the photographs.
+    pub fn random(rng: &mut ChaCha8Rng, texel: f64, photos: &[Arc<Photo>]) -> Self {
+        if !photos.is_empty() && rng.random_bool(0.3) {
+            let photo = photos[rng.random_range(0..photos.len())].clone();
+            return Self::photo(rng, texel, photo);
+        }
         let known = [
             Pattern::Bricks,
             Pattern::Cobbles,
@@ -101,6 +112,14 @@ impl Layer {
         Self::new(rng, motif, scale)
     }
 
+    fn photo(rng: &mut ChaCha8Rng, texel: f64, photo: Arc<Photo>) -> Self {
+        let scale = log_uniform(rng, 60.0 * texel, 500.0 * texel);
+        let mut layer = Self::new(rng, Motif::Photo, scale);
+        layer.mean = photo.mean();
+        layer.photo = Some(photo);
+        layer
+    }
+
     /// One colour, a gradient, or clouds so faint that matching has little to go by.
     pub fn plain(rng: &mut ChaCha8Rng, texel: f64) -> Self {
         let motif = match rng.random_range(0..6) {
@@ -131,6 +150,7 @@ impl Layer {
             palette,
             mean: mean(&palette),
             seed: rng.random(),
+            photo: None,
         }
     }
 
@@ -138,6 +158,12 @@ impl Layer {
     pub fn color(&self, spot: &Spot, footprint: f32) -> Rgb {
         if self.motif == Motif::Flat {
             return self.palette[0];
+        }
+        if let Some(photo) = &self.photo {
+            let [a, b] = spot.along.map(|c| c / self.scale);
+            let [cos, sin] = self.turn;
+            let (u, v) = (a * cos - b * sin, a * sin + b * cos);
+            return photo.color(u, v / photo.aspect(), footprint / self.scale, true);
         }
         let visible = resolved(self.scale * self.motif.finest(), footprint);
         if visible <= 0.0 {
@@ -157,7 +183,7 @@ impl Layer {
         let soft = (0.6 * footprint / self.scale).max(1e-4);
         let seed = self.seed;
         match self.motif {
-            Motif::Flat => first,
+            Motif::Flat | Motif::Photo => first,
             Motif::Known(pattern) => {
                 let material =
                     Material { pattern, scale: 1.0, palette: self.palette, grain: 0.0, gloss: 0.0, seed };
@@ -322,8 +348,11 @@ fn palette(rng: &mut ChaCha8Rng) -> [Rgb; 3] {
 /// Mostly muted colours, some strong ones.
 pub fn color(rng: &mut ChaCha8Rng) -> Rgb {
     let value = log_uniform(rng, 0.05, 0.8) as f32;
-    let saturation = rng.random_range(0.0_f32..1.0).powi(2);
-    let hue = rng.random_range(0.0_f32..3.0);
+    let strong = rng.random_bool(0.25);
+    let saturation = rng.random_range(0.0_f32..1.0).powi(if strong { 1 } else { 3 });
+    // Earth, wood, skin, brick and grass lie between red and green.
+    let hue =
+        if rng.random_bool(0.5) { rng.random_range(0.0_f32..1.0) } else { rng.random_range(0.0_f32..3.0) };
     std::array::from_fn(|c| {
         let distance = (hue - c as f32).abs();
         let share = (1.5 - distance.min(3.0 - distance)).clamp(0.0, 1.0);

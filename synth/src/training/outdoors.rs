@@ -7,6 +7,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::draw::{along, log_uniform, pick, yaw};
+use super::library::Library;
 use super::light::Light;
 use super::paint::Paint;
 use super::settings::{Frame, distance_for, field_of_view};
@@ -16,11 +17,11 @@ use crate::geometry::{Heightfield, Shape};
 use crate::noise::octaves;
 
 /// Terrain, houses, trees and near clutter from eye height; the far end is tens of times the near.
-pub fn street(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
+pub fn street(rng: &mut ChaCha8Rng, library: &Library, frame: Frame) -> (Stage, Shot) {
     let field = field_of_view(rng);
     let eye = rng.random_range(1.2..2.2);
     let texel = frame.texel(9.0, field);
-    let mut builder = Builder::new(rng, texel);
+    let mut builder = Builder::new(rng, library, texel);
     let hills = builder.size(0.2, 9.0);
     let ground = terrain(&mut builder, [110.0, 110.0], hills, 0.02);
     let height = |x: f64, y: f64| ground.height(x, y);
@@ -52,10 +53,10 @@ pub fn street(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
 }
 
 /// Roofs, trees and fields from above, straight down or slanted.
-pub fn aerial(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
+pub fn aerial(rng: &mut ChaCha8Rng, library: &Library, frame: Frame) -> (Stage, Shot) {
     let field = rng.random_range(35.0..70.0);
     let altitude = rng.random_range(40.0..120.0);
-    let mut builder = Builder::new(rng, frame.texel(altitude, field));
+    let mut builder = Builder::new(rng, library, frame.texel(altitude, field));
     let hills = builder.size(0.5, 25.0);
     let ground = terrain(&mut builder, [260.0, 260.0], hills, 0.006);
     let paint = builder.paint();
@@ -91,10 +92,10 @@ pub fn aerial(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
 }
 
 /// A wall with ledges, columns, windows and ornament, head-on or slanted.
-pub fn facade(rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
+pub fn facade(rng: &mut ChaCha8Rng, library: &Library, frame: Frame) -> (Stage, Shot) {
     let field = field_of_view(rng);
     let distance = distance_for(5.0, field) * log_uniform(rng, 0.5, 1.6);
-    let mut builder = Builder::new(rng, frame.texel(distance, field));
+    let mut builder = Builder::new(rng, library, frame.texel(distance, field));
     let level = Matrix3::identity();
     let wall = builder.paint();
     if builder.chance(0.4) {

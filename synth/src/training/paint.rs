@@ -1,12 +1,15 @@
 //! What surfaces of training scenes look like: a motif, perhaps a second one in places, and grain;
 //! shine on top. Whatever is finer than a pixel fades to its mean, so one ray per pixel does not alias.
 
+use std::sync::Arc;
+
 use nalgebra::Vector3;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::draw::{log_uniform, pick};
 use super::motif::{Layer, blend};
+use super::photo::Photo;
 use crate::geometry::Hit;
 use crate::noise::{gradient_noise, smoothstep};
 use crate::texture::{Rgb, Spot};
@@ -15,6 +18,8 @@ use crate::texture::{Rgb, Spot};
 #[derive(Clone, Debug)]
 pub struct Paint {
     base: Layer,
+    /// The texture of a scanned thing, which covers all layers.
+    skin: Option<Skin>,
     overlay: Option<Overlay>,
     grain: Grain,
     /// Height of the bumps over their wavelength; 0 is smooth.
@@ -27,6 +32,14 @@ pub struct Paint {
     pub sharpness: f32,
     /// The share of light that is mirrored from the surroundings.
     pub mirror: f32,
+}
+
+/// A texture that the surface's own coordinates address.
+#[derive(Clone, Debug)]
+struct Skin {
+    photo: Arc<Photo>,
+    /// How far its coordinates run per unit of length.
+    per_length: f32,
 }
 
 /// A second layer where noise passes a threshold.
@@ -60,30 +73,31 @@ pub enum Busyness {
 impl Paint {
     /// Any look. `texel` is the size of a pixel on the surface at the distance it is made for, in
     /// scene units; structures are a few to a few hundred of these.
-    pub fn random(rng: &mut ChaCha8Rng, texel: f64, busyness: Busyness) -> Self {
-        let plain = busyness == Busyness::Plain || rng.random_bool(0.12);
-        let base = if plain { Layer::plain(rng, texel) } else { Layer::random(rng, texel) };
+    pub fn random(rng: &mut ChaCha8Rng, texel: f64, busyness: Busyness, photos: &[Arc<Photo>]) -> Self {
+        let plain = busyness == Busyness::Plain || rng.random_bool(0.08);
+        let base = if plain { Layer::plain(rng, texel) } else { Layer::random(rng, texel, photos) };
         let overlay = (!plain && rng.random_bool(0.3)).then(|| Overlay {
-            layer: Layer::random(rng, texel),
+            layer: Layer::random(rng, texel, photos),
             wavelength: log_uniform(rng, 20.0 * texel, 200.0 * texel) as f32,
             threshold: rng.random_range(-0.2..0.4),
             seed: rng.random(),
         });
         let height = match (plain, rng.random_range(0..10)) {
-            (true, 0..4) | (false, 0..2) => 0.0,
+            (true, 0..3) | (false, 0) => 0.0,
             (true, _) => log_uniform(rng, 0.005, 0.06),
-            (false, _) => log_uniform(rng, 0.04, 0.5),
+            (false, _) => log_uniform(rng, 0.06, 0.6),
         };
         let grain = Grain {
             height: height as f32,
-            wavelength: log_uniform(rng, 4.0 * texel, 80.0 * texel) as f32,
-            octaves: rng.random_range(1..=4),
+            wavelength: log_uniform(rng, 5.0 * texel, 80.0 * texel) as f32,
+            octaves: rng.random_range(2..=5),
             persistence: rng.random_range(0.4..0.95),
             seed: rng.random(),
         };
         let shiny = rng.random_bool(0.3);
         Self {
             base,
+            skin: None,
             overlay,
             grain,
             bump: if rng.random_bool(0.25) { rng.random_range(0.05..0.35) } else { 0.0 },
@@ -94,8 +108,18 @@ impl Paint {
         }
     }
 
+    /// This paint under the texture of a scanned thing, whose coordinates run `per_length` per unit.
+    #[must_use]
+    pub fn with_skin(self, photo: Arc<Photo>, per_length: f32) -> Self {
+        Self { skin: Some(Skin { photo, per_length }), bump: 0.0, ..self }
+    }
+
     /// The share of light the surface throws back at a spot, where a pixel is `footprint` wide.
     pub fn albedo(&self, spot: &Spot, footprint: f32) -> Rgb {
+        if let Some(Skin { photo, per_length }) = &self.skin {
+            let [u, v] = spot.along;
+            return photo.color(u, v, footprint * per_length, false).map(|c| c.clamp(0.01, 0.95));
+        }
         let mut color = self.base.color(spot, footprint);
         if let Some(Overlay { layer, wavelength, threshold, seed }) = &self.overlay {
             let noise = gradient_noise(spot.local.map(|v| v / wavelength), *seed);

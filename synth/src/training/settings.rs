@@ -5,6 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::draw::log_uniform;
+use super::library::Library;
 use super::stage::{Shot, Stage};
 use super::{indoors, outdoors};
 
@@ -57,16 +58,16 @@ impl Setting {
         }
     }
 
-    pub(super) fn build(self, rng: &mut ChaCha8Rng, frame: Frame) -> (Stage, Shot) {
+    pub(super) fn build(self, rng: &mut ChaCha8Rng, library: &Library, frame: Frame) -> (Stage, Shot) {
         match self {
-            Self::Objects => indoors::objects(rng, frame),
-            Self::Heap => indoors::heap(rng, frame),
-            Self::Room => indoors::room(rng, frame),
-            Self::Corridor => indoors::corridor(rng, frame),
-            Self::Floating => indoors::floating(rng, frame),
-            Self::Street => outdoors::street(rng, frame),
-            Self::Aerial => outdoors::aerial(rng, frame),
-            Self::Facade => outdoors::facade(rng, frame),
+            Self::Objects => indoors::objects(rng, library, frame),
+            Self::Heap => indoors::heap(rng, library, frame),
+            Self::Room => indoors::room(rng, library, frame),
+            Self::Corridor => indoors::corridor(rng, library, frame),
+            Self::Floating => indoors::floating(rng, library, frame),
+            Self::Street => outdoors::street(rng, library, frame),
+            Self::Aerial => outdoors::aerial(rng, library, frame),
+            Self::Facade => outdoors::facade(rng, library, frame),
         }
     }
 }

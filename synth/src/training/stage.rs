@@ -5,6 +5,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::draw::{along, log_uniform};
+use super::library::Library;
 use super::light::Light;
 use super::paint::{Busyness, Paint};
 use crate::geometry::{Body, Placement, Shape, World};
@@ -45,13 +46,14 @@ pub struct Builder<'a> {
     pub rng: &'a mut ChaCha8Rng,
     /// The size of a pixel at the distance that most is seen from, in scene units.
     pub texel: f64,
+    pub library: &'a Library,
     bodies: Vec<Body>,
     paints: Vec<Paint>,
 }
 
 impl<'a> Builder<'a> {
-    pub fn new(rng: &'a mut ChaCha8Rng, texel: f64) -> Self {
-        Self { rng, texel, bodies: Vec::new(), paints: Vec::new() }
+    pub fn new(rng: &'a mut ChaCha8Rng, library: &'a Library, texel: f64) -> Self {
+        Self { rng, texel, library, bodies: Vec::new(), paints: Vec::new() }
     }
 
     pub fn stage(self, light: Light) -> Stage {
@@ -60,12 +62,12 @@ impl<'a> Builder<'a> {
 
     /// Any paint with structures of the stage's size.
     pub fn paint(&mut self) -> Paint {
-        Paint::random(self.rng, self.texel, Busyness::Any)
+        Paint::random(self.rng, self.texel, Busyness::Any, &self.library.photos)
     }
 
     /// A paint that gives little to match.
     pub fn plain_paint(&mut self) -> Paint {
-        Paint::random(self.rng, self.texel, Busyness::Plain)
+        Paint::random(self.rng, self.texel, Busyness::Plain, &[])
     }
 
     pub fn add(&mut self, shape: Shape, centre: Point3<f64>, rotation: Matrix3<f64>, paint: &Paint) {

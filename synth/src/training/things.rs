@@ -6,9 +6,10 @@ use nalgebra::{Matrix3, Point3, Vector3};
 use rand::RngExt;
 
 use super::draw::{along, direction, log_uniform, pick, rotation, yaw};
+use super::moulded::mould;
 use super::paint::Paint;
 use super::stage::Builder;
-use crate::geometry::Shape;
+use crate::geometry::{MeshShape, Shape};
 
 /// Kinds of things, all of about the size that is asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,10 +30,12 @@ pub enum Thing {
     Stairs,
     Bottle,
     Tree,
+    Moulded,
+    Scanned,
 }
 
 /// What lies on tables and floors.
-pub const SMALL_THINGS: [Thing; 12] = [
+pub const SMALL_THINGS: [Thing; 16] = [
     Thing::Crates,
     Thing::Crates,
     Thing::Ball,
@@ -45,10 +48,14 @@ pub const SMALL_THINGS: [Thing; 12] = [
     Thing::Bottle,
     Thing::Rubble,
     Thing::Stairs,
+    Thing::Moulded,
+    Thing::Moulded,
+    Thing::Scanned,
+    Thing::Scanned,
 ];
 
 /// What stands in rooms.
-pub const FURNITURE: [Thing; 9] = [
+pub const FURNITURE: [Thing; 11] = [
     Thing::Table,
     Thing::Table,
     Thing::Chair,
@@ -58,10 +65,12 @@ pub const FURNITURE: [Thing; 9] = [
     Thing::Bush,
     Thing::Tripod,
     Thing::Vase,
+    Thing::Moulded,
+    Thing::Scanned,
 ];
 
 /// What stands in the open.
-pub const STREET_THINGS: [Thing; 10] = [
+pub const STREET_THINGS: [Thing; 12] = [
     Thing::Tree,
     Thing::Tree,
     Thing::Bush,
@@ -72,6 +81,8 @@ pub const STREET_THINGS: [Thing; 10] = [
     Thing::Rubble,
     Thing::Stairs,
     Thing::Tripod,
+    Thing::Moulded,
+    Thing::Scanned,
 ];
 
 impl Builder<'_> {
@@ -125,6 +136,8 @@ impl Builder<'_> {
             }
             Thing::Stairs => self.add_stairs(foot, turn, size),
             Thing::Bottle => self.add_bottle(foot, turn, size),
+            Thing::Moulded => self.add_moulded(foot, turn, size),
+            Thing::Scanned => self.add_scanned(foot, turn, size),
         }
     }
 
@@ -267,6 +280,36 @@ impl Builder<'_> {
         self.add(Shape::Ellipsoid { radii: shoulder }, up(2.0 * body), turn, &glass);
         let neck = Shape::Cylinder { radius: 0.35 * radius, half_height: 0.18 * size };
         self.add(neck, up(2.0 * body + 0.2 * size), turn, &glass);
+    }
+
+    /// A mesh made up, standing.
+    fn add_moulded(&mut self, foot: Point3<f64>, turn: Matrix3<f64>, size: f64) {
+        let mesh = mould(self.rng);
+        let scale = size / 2.0;
+        let low = mesh.bounds().map_or(0.0, |bounds| bounds.min.z * scale);
+        let paint = self.paint();
+        let shape = Shape::Mesh(MeshShape { mesh, scale, textured: false });
+        self.add(shape, foot - Vector3::z() * low, turn, &paint);
+    }
+
+    /// A mesh of the library in any position, mostly in its own colours; a made up one without any.
+    fn add_scanned(&mut self, foot: Point3<f64>, turn: Matrix3<f64>, size: f64) {
+        let library = self.library;
+        if library.meshes.is_empty() {
+            return self.add_moulded(foot, turn, size);
+        }
+        let scan = &library.meshes[self.rng.random_range(0..library.meshes.len())];
+        let turn = if self.chance(0.6) { turn } else { rotation(self.rng) };
+        let scale = size / scan.size;
+        let mut paint = self.paint();
+        let skin = scan.texture.clone().filter(|_| self.chance(0.75));
+        let textured = skin.is_some();
+        if let Some(photo) = skin {
+            paint = paint.with_skin(photo, (scan.uv_per_length / scale) as f32);
+        }
+        let middle = foot + Vector3::z() * (scan.reach_down(&turn) * scale);
+        let shape = Shape::Mesh(MeshShape { mesh: scan.mesh.clone(), scale, textured });
+        self.add(shape, middle - turn * scan.middle * scale, turn, &paint);
     }
 
     /// One convex or ring-shaped body of about `radius`.
