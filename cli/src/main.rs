@@ -11,6 +11,7 @@ mod network;
 mod out_folder;
 mod run_record;
 mod supervisor;
+mod training;
 
 use std::io::{Write, stdout};
 use std::process::ExitCode;
@@ -29,6 +30,7 @@ fn main() -> ExitCode {
         Command::Inspect(args) => commands::inspect::run(&args),
         Command::Depth(args) => commands::depth::run(&args),
         Command::Synth(args) => commands::synth::run(&args),
+        Command::Train(args) => commands::train::run(&args),
         Command::Weights(args) => commands::weights::run(&args),
         Command::Evaluate(args) => commands::evaluate::run(&args),
         Command::Worker(args) => commands::worker::run(args),

@@ -30,7 +30,7 @@ fn widened(trained_px: Option<f64>, spacing_px: f64) -> u32 {
 
 /// How far one step in the middle of the hypotheses moves the centre of the reference image in the source, in
 /// pixels of the source; zero when it is not seen there.
-fn spacing_px(reference: &Camera, source: &Camera, hypotheses: &DepthHypotheses) -> f64 {
+pub(crate) fn spacing_px(reference: &Camera, source: &Camera, hypotheses: &DepthHypotheses) -> f64 {
     let size = reference.intrinsics;
     let centre = Point2::new(f64::from(size.width - 1) / 2.0, f64::from(size.height - 1) / 2.0);
     let middle = f64::from(hypotheses.count() / 2);

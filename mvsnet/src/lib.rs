@@ -14,6 +14,7 @@ mod cpu_backend;
 mod feature_cache;
 mod input;
 mod kernels;
+pub mod train;
 mod weights;
 
 #[cfg(feature = "torch")]

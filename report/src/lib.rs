@@ -7,6 +7,8 @@
 
 mod cloud_picture;
 mod colormap;
+mod curve_plot;
+mod event_file;
 mod font;
 mod html;
 mod picture;
@@ -16,6 +18,8 @@ mod run_report;
 
 pub use cloud_picture::render_cloud;
 pub use colormap::{confidence_color, depth_color};
+pub use curve_plot::{Curve, plot_curves};
+pub use event_file::{event_file_start, scalar_event};
 pub use html::{Pictures, render_html};
 pub use picture::{PictureError, encode_png};
 pub use preview::{PreviewError, PreviewOptions, draw_preview};

@@ -15,6 +15,7 @@ use crate::commands::evaluate::EvaluateCommand;
 use crate::commands::inspect::InspectArgs;
 use crate::commands::reconstruct::ReconstructArgs;
 use crate::commands::synth::SynthArgs;
+use crate::commands::train::TrainArgs;
 use crate::commands::weights::WeightsCommand;
 use crate::commands::worker::WorkerArgs;
 
@@ -49,6 +50,8 @@ pub enum Command {
     Depth(DepthArgs),
     /// Make a scene with exact ground truth.
     Synth(SynthArgs),
+    /// Train weights from scratch on generated scenes; the same command again resumes.
+    Train(TrainArgs),
     /// Import or inspect weights of the network.
     #[command(subcommand)]
     Weights(WeightsCommand),

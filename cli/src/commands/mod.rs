@@ -6,5 +6,6 @@ mod export;
 pub mod inspect;
 pub mod reconstruct;
 pub mod synth;
+pub mod train;
 pub mod weights;
 pub mod worker;

@@ -41,7 +41,7 @@ impl FeatureLayers {
             let FoldedConvolution { shape, weight, bias } = folded(i);
             let inputs = shape[1];
             let kernel = |o, c, row, k| weight[(o * inputs + c) * 25 + row * 5 + k];
-            StridedLayer::new(level, [inputs, shape[0], 5, 5], kernel, &bias)
+            StridedLayer::new(level, [inputs, shape[0], 5, 5], kernel, &bias, true)
         };
         Self {
             full: [plain(0), plain(1)],
@@ -69,7 +69,7 @@ impl RegularizationLayers {
             let FoldedConvolution { shape, weight, bias } = folded(i);
             let inputs = shape[1];
             let kernel = |o, c, tap, k| weight[volume_tap(o * inputs + c, k, tap / 3, tap % 3)];
-            StridedLayer::new(level, [inputs, shape[0], 9, 3], kernel, &bias)
+            StridedLayer::new(level, [inputs, shape[0], 9, 3], kernel, &bias, true)
         };
         let up = |i: usize| {
             let name = format!("cost_regularization.conv{i}");
@@ -77,8 +77,8 @@ impl RegularizationLayers {
             let FoldedConvolution { shape, weight, bias } =
                 weights.normalised(&convolution, &batch_norm, KernelOrder::InputFirst);
             let outputs = shape[1];
-            let kernel = |o, c, y, x, k| weight[volume_tap(c * outputs + o, k, y, x)];
-            TransposedLayer::new(level, [shape[0], outputs], kernel, &bias)
+            let kernel = |o, c, tap, k| weight[volume_tap(c * outputs + o, k, tap / 3, tap % 3)];
+            TransposedLayer::new(level, [shape[0], outputs, 9, 3], kernel, &bias, true)
         };
         let prob = weights.biased("cost_regularization.prob");
         let kernel = |c, y, x, k| prob.weight[volume_tap(c, k, y, x)];

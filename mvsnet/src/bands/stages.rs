@@ -259,7 +259,7 @@ impl UpStage {
                 for (row, tap) in &rows {
                     columns.extend(taps(x, inputs).map(|(x, at)| (row.column(x as isize), 3 * tap + at)));
                 }
-                layer.apply(&columns, skip.column(x as isize), output);
+                layer.apply(&columns, Some(skip.column(x as isize)), shape.length, output);
             });
         });
         self.kept = kept.into_iter().next_back();

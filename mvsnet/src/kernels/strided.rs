@@ -13,6 +13,7 @@ pub(crate) struct StridedLayer {
     pub(crate) outputs: usize,
     /// Size of the kernel along the contiguous axis: 3 or 5.
     size: usize,
+    relu: bool,
     level: Level,
     /// `[tap][output / block][input][k][output % block]`.
     weights: Vec<Aligned>,
@@ -21,7 +22,7 @@ pub(crate) struct StridedLayer {
 
 impl StridedLayer {
     /// `weight(output, input, tap, k)` is the kernel, where `tap` counts input columns and `k` runs along the
-    /// contiguous axis. ReLU follows.
+    /// contiguous axis. ReLU may follow.
     ///
     /// # Panics
     /// When `outputs` is no multiple of 8.
@@ -30,6 +31,7 @@ impl StridedLayer {
         [inputs, outputs, taps, size]: [usize; 4],
         weight: impl Fn(usize, usize, usize, usize) -> f64,
         bias: &[f64],
+        relu: bool,
     ) -> Self {
         assert!(outputs.is_multiple_of(8) && (size == 3 || size == 5));
         let block = level.outputs_at_once();
@@ -48,7 +50,7 @@ impl StridedLayer {
         });
         let weights = weights.collect();
         let bias = bias.iter().map(|bias| *bias as f32).collect();
-        Self { inputs, outputs, size, level, weights, bias }
+        Self { inputs, outputs, size, relu, level, weights, bias }
     }
 
     /// Computes one output column, of half the input's length (rounded up), from input columns, each with its
@@ -112,7 +114,9 @@ unsafe fn column<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(task: &Tas
             for o in 0..OUTPUTS {
                 let to = task.output.add((output + o) * task.to.stride() + COLUMN_START + begin);
                 for v in 0..VECTORS {
-                    S::store(to.add(v * LANES), S::max(sums[o][v], S::splat(0.0)));
+                    let sum = sums[o][v];
+                    let sum = if layer.relu { S::max(sum, S::splat(0.0)) } else { sum };
+                    S::store(to.add(v * LANES), sum);
                 }
                 for beyond in task.to.length.max(begin)..begin + VECTORS * LANES {
                     *to.add(beyond - begin) = 0.0;

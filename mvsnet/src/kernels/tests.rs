@@ -141,7 +141,7 @@ proptest! {
         let bias = random(outputs, seed ^ 0x78);
         let kernel = |o, c, tap, k| weights[((o * inputs + c) * taps + tap) * size + k];
         let run = |level| {
-            let layer = StridedLayer::new(level, [inputs, outputs, taps, size], kernel, &bias);
+            let layer = StridedLayer::new(level, [inputs, outputs, taps, size], kernel, &bias, true);
             let shape = Shape { columns: 1, channels: outputs, length: length.div_ceil(2) };
             let mut output = Slab::zeroed(shape);
             let columns: Vec<_> = (0..taps).map(|tap| (input.column(tap as isize), tap)).collect();
@@ -161,36 +161,40 @@ proptest! {
     #[test]
     fn transposed_is_the_convolution_transposed(
         length in 1_usize..200, inputs in 1_usize..10, taps in proptest::sample::subsequence((0..9).collect::<Vec<_>>(), 1..5),
-        seed: u64,
+        five: bool, plain: bool, seed: u64,
     ) {
+        let size = if five { 5 } else { 3 };
         let outputs = 8;
         let half = length.div_ceil(2);
         let input = random_slab(Shape { columns: taps.len(), channels: inputs, length: half }, seed);
         let skip = random_slab(Shape { columns: 1, channels: outputs, length }, seed ^ 5);
-        let weights = random(outputs * inputs * 27, seed ^ 0x77);
+        let weights = random(outputs * inputs * 9 * size, seed ^ 0x77);
         let bias = random(outputs, seed ^ 0x78);
-        let kernel = |o, c, y, x, k| weights[(((o * inputs + c) * 3 + y) * 3 + x) * 3 + k];
+        let kernel = |o, c, tap, k| weights[((o * inputs + c) * 9 + tap) * size + k];
         let run = |level| {
-            let layer = TransposedLayer::new(level, [inputs, outputs], kernel, &bias);
+            let layer = TransposedLayer::new(level, [inputs, outputs, 9, size], kernel, &bias, !plain);
             let mut output = Slab::zeroed(skip.shape());
             let columns = (0..).zip(&taps).map(|(i, tap)| (input.column(i), *tap));
-            layer.apply(&columns.collect::<Vec<_>>(), skip.column(0), output.columns_mut());
+            let skip = (!plain).then(|| skip.column(0));
+            layer.apply(&columns.collect::<Vec<_>>(), skip, length, output.columns_mut());
             output
         };
         check(run, |_, o, i| {
-            // Input j reaches output 2j - 1 + k.
-            let reach = (0..3_isize).filter(|k| (i + 1 - k) % 2 == 0);
-            let reach: Vec<_> = reach.map(|k| (k as usize, (i + 1 - k) / 2)).collect();
+            // Input j reaches output 2j - size / 2 + k.
+            let half = size as isize / 2;
+            let reach = (0..size as isize).filter(|k| (i + half - k) % 2 == 0);
+            let reach: Vec<_> = reach.map(|k| (k as usize, (i + half - k) / 2)).collect();
             let terms = taps.iter().enumerate().flat_map(|(column, tap)| {
                 (0..inputs).flat_map(move |c| [(column, *tap, c)])
             });
             let (value, magnitude) = sum(terms.flat_map(|(column, tap, c)| {
                 let (input, kernel) = (&input, &kernel);
                 reach.iter().map(move |(k, j)| {
-                    kernel(o, c, tap / 3, tap % 3, *k) * at(input, column as isize, c, *j)
+                    kernel(o, c, tap, *k) * at(input, column as isize, c, *j)
                 })
             }));
-            ((value + bias[o]).max(0.0) + at(&skip, 0, o, i), magnitude + 2.0)
+            let value = value + bias[o];
+            (if plain { value } else { value.max(0.0) + at(&skip, 0, o, i) }, magnitude + 2.0)
         });
     }
 

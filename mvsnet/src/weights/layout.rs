@@ -7,8 +7,9 @@ use super::{Refinement, WeightTensor, WeightsError, WeightsMetadata};
 /// Statistics and affine parameters of a batch normalisation, each with one value per channel.
 const BATCH_NORM: [&str; 4] = ["weight", "bias", "running_mean", "running_var"];
 
-/// Every tensor of a network with this refinement, by name.
-pub(super) fn tensors(refinement: Refinement) -> BTreeMap<String, Vec<usize>> {
+/// Every tensor of a network that is made so, by name.
+pub(crate) fn tensors(metadata: &WeightsMetadata) -> BTreeMap<String, Vec<usize>> {
+    let refinement = metadata.refinement;
     let mut layout = Layout(BTreeMap::new());
     // Section 3.1: output channels, input channels, kernel size.
     for (i, (o, c, k)) in
@@ -80,7 +81,7 @@ pub(super) fn check(
     metadata: &WeightsMetadata,
     tensors: &BTreeMap<String, WeightTensor>,
 ) -> Result<(), WeightsError> {
-    let expected = self::tensors(metadata.refinement);
+    let expected = self::tensors(metadata);
     if let Some(name) = tensors.keys().find(|name| !expected.contains_key(*name)) {
         return Err(WeightsError::UnknownTensor { name: name.clone() });
     }

@@ -3,7 +3,7 @@
 mod checkpoint;
 mod file;
 mod folded;
-mod layout;
+pub(crate) mod layout;
 mod pickle;
 mod seeded;
 
@@ -16,6 +16,7 @@ use thiserror::Error;
 pub use checkpoint::CheckpointError;
 pub(crate) use folded::{FoldedConvolution, KernelOrder};
 pub use pickle::PickleError;
+pub(crate) use seeded::fan_in;
 #[cfg(test)]
 pub(crate) use seeded::uniform;
 

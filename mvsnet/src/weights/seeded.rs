@@ -26,7 +26,7 @@ impl Weights {
     /// any other program can make the same ones (`tests/golden/make_golden.py` does).
     pub fn seeded(metadata: WeightsMetadata, seed: u64) -> Self {
         let mut state = seed;
-        let tensors = layout::tensors(metadata.refinement)
+        let tensors = layout::tensors(&metadata)
             .into_iter()
             .map(|(name, shape)| {
                 let (low, high) = range(&name, &shape);
@@ -42,12 +42,7 @@ impl Weights {
 /// The interval a tensor's values are drawn from.
 fn range(name: &str, shape: &[usize]) -> (f64, f64) {
     if shape.len() > 1 {
-        let transposed = name.ends_with(".0.weight");
-        let inputs = if transposed { shape[0] } else { shape[1] };
-        let fan_in = inputs * shape[2..].iter().product::<usize>();
-        // A stride of two leaves an output of a transposed layer an eighth of the taps.
-        let fan_in = if transposed { fan_in as f64 / 8.0 } else { fan_in as f64 };
-        let bound = (6.0 / fan_in).sqrt();
+        let bound = (6.0 / fan_in(name, shape)).sqrt();
         // Residuals are small, so that refined depth stays in the range.
         let bound = if name.starts_with("refine_network.res") { 0.1 * bound } else { bound };
         (-bound, bound)
@@ -56,6 +51,15 @@ fn range(name: &str, shape: &[usize]) -> (f64, f64) {
     } else {
         (-0.2, 0.2)
     }
+}
+
+/// How many products make an output of the convolution with this kernel, on average.
+pub(crate) fn fan_in(name: &str, shape: &[usize]) -> f64 {
+    let transposed = name.ends_with(".0.weight");
+    let inputs = if transposed { shape[0] } else { shape[1] };
+    let fan_in = (inputs * shape[2..].iter().product::<usize>()) as f64;
+    // A stride of two leaves an output of a transposed layer an eighth of the taps.
+    if transposed { fan_in / 8.0 } else { fan_in }
 }
 
 /// The next number of [0, 1), a multiple of 2^-24.

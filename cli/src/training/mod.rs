@@ -1,0 +1,9 @@
+//! What surrounds a training run: its samples, its curves, the wish to stop it.
+
+mod curves;
+mod samples;
+mod stop;
+
+pub use self::curves::Curves;
+pub use self::samples::SynthSamples;
+pub use self::stop::Stop;
