@@ -42,7 +42,7 @@ pub use pfm::{PfmError, PfmFormatError, decode_pfm, encode_pfm, read_depth_pfm, 
 pub use raster::{Raster, RasterError};
 pub use read::{
     DepthLine, NameError, PixelCentre, ReadError, ReadOptions, ResolveError, SceneFormat, ViewError,
-    read_scene, resolve_inside, safe_name,
+    read_mvsnet_cam, read_mvsnet_pairs, read_scene, resolve_inside, safe_name,
 };
 pub use scene::{DepthRange, Scene, SourceScore, SparsePoints, View};
 pub use stitch::StitchError;

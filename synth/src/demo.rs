@@ -4,8 +4,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder, ImageError};
+use image::ImageError;
 use planesweep_scene::{
     Distortion, PfmError, Raster, Scene, View, ViewId, WriteError, write_atomically, write_colmap, write_pfm,
 };
@@ -13,6 +12,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::training_folder::encode_png;
 use crate::{Style, SynthScene};
 
 /// What [`write_demo`] writes.
@@ -118,15 +118,8 @@ pub fn write_demo(out: &Path, options: &DemoOptions) -> Result<Scene, DemoError>
 }
 
 fn write_png(path: &Path, image: &Raster<[u8; 3]>) -> Result<(), DemoError> {
-    let mut bytes = Vec::new();
-    PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
-        .write_image(
-            image.values().as_flattened(),
-            image.width() as u32,
-            image.height() as u32,
-            ExtendedColorType::Rgb8,
-        )
-        .map_err(|source| DemoError::EncodeImage { path: path.to_owned(), source })?;
+    let bytes =
+        encode_png(image).map_err(|source| DemoError::EncodeImage { path: path.to_owned(), source })?;
     write_atomically(path, &bytes).map_err(|source| DemoError::WriteImage { path: path.to_owned(), source })
 }
 

@@ -8,8 +8,10 @@
 
 mod camera_path;
 mod courtyard;
+mod data_set;
 mod demo;
 mod geometry;
+mod mesh_depth;
 mod mesh_file;
 mod noise;
 mod render;
@@ -18,8 +20,19 @@ mod shade;
 mod sparse;
 mod texture;
 mod training;
+mod training_folder;
 
+pub use data_set::{DataSet, DataSetError, DtuSplit, SampleShape};
 pub use demo::{DemoError, DemoOptions, write_demo};
+pub use geometry::TriangleMesh;
+pub use mesh_depth::{
+    MeshDepthError, MeshDepthOptions, MeshDepthReport, depth_range_of_mesh, render_mesh_depth,
+    write_mesh_depth,
+};
 pub use mesh_file::{MeshError, is_mesh, read_mesh};
 pub use scene::{Style, SynthScene};
-pub use training::{Library, LibraryError, Setting, TrainingOptions, training_sample, training_sample_with};
+pub use training::{
+    Library, LibraryError, Setting, TrainingOptions, training_sample, training_sample_with,
+    write_training_sample,
+};
+pub use training_folder::TrainingFolderError;

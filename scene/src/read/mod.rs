@@ -23,6 +23,7 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 pub use detect::SceneFormat;
+pub use mvsnet::{read_mvsnet_cam, read_mvsnet_pairs};
 pub use names::{NameError, ResolveError, resolve_inside, safe_name};
 
 use crate::{CameraError, Scene, SizeMismatch};

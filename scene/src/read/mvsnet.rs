@@ -9,7 +9,7 @@ use nalgebra::{Matrix3, Vector3};
 use super::pairs::parse_pairs;
 use super::views::{Candidate, Geometry, admit};
 use super::{DepthLine, PixelCentre, ReadError, ReadOptions, ViewError, read_text};
-use crate::{DepthRange, Distortion, Intrinsics, Pose, Scene, ViewId};
+use crate::{Camera, DepthRange, Distortion, Intrinsics, Pose, Scene, SourceScore, ViewId};
 
 /// The number of planes and the factor on the interval that files of "minimum, interval" were made for.
 const DEFAULT_PLANES: u32 = 192;
@@ -60,6 +60,31 @@ pub(super) fn read(root: &Path, options: &ReadOptions) -> Result<Scene, ReadErro
         *pairs = parse_pairs(&pair_path, &read_text(&pair_path)?, |id| views.contains_key(&id), warnings)?;
     }
     Ok(scene)
+}
+
+/// Reads a cam.txt that stands alone, for an image of `width` by `height`: the camera, and the depth
+/// range where the file states one.
+pub fn read_mvsnet_cam(
+    path: &Path,
+    width: u32,
+    height: u32,
+    options: &ReadOptions,
+) -> Result<(Camera, Option<DepthRange>), ReadError> {
+    let refused = |source| ReadError::View { view: path.display().to_string(), source };
+    let (geometry, _) =
+        parse_camera(&read_text(path)?, options).map_err(|error| refused(error.at(path.to_owned())))?;
+    let intrinsics = geometry.intrinsics.with_size(width, height).checked();
+    let intrinsics = intrinsics.map_err(|error| refused(error.into()))?;
+    Ok((Camera { intrinsics, pose: geometry.pose }, geometry.depth_range))
+}
+
+/// Reads a pair.txt that stands alone. Entries that name an unknown view, the reference view itself or
+/// a source for the second time are left out.
+pub fn read_mvsnet_pairs(
+    path: &Path,
+    is_known: impl Fn(ViewId) -> bool,
+) -> Result<BTreeMap<ViewId, Vec<SourceScore>>, ReadError> {
+    parse_pairs(path, &read_text(path)?, is_known, &mut Vec::new())
 }
 
 /// The files of a folder whose `stem` is a number, by it; of several with one number, the first by name.

@@ -8,7 +8,7 @@ mod torus;
 mod world;
 
 pub use heightfield::Heightfield;
-pub use mesh::{MeshShape, TriangleMesh};
+pub use mesh::{MeshHit, MeshShape, TriangleMesh};
 pub use shape::Shape;
 pub use world::{Body, Hit, Placement, World};
 

@@ -145,3 +145,46 @@ fn photo(path: &Path) -> Result<Arc<Photo>, LibraryError> {
     let image = read_image(path).map_err(|source| LibraryError::Texture { path: path.to_owned(), source })?;
     Ok(Arc::new(Photo::new(image)))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Setting, TrainingOptions, training_sample, training_sample_with};
+
+    #[test]
+    fn a_folder_adds_textured_meshes_and_photographs_to_the_scenes() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let inner = folder.path().join("inner");
+        fs::create_dir(&inner).expect("made");
+        let obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\n\
+                   f 1/1 3/3 2/2\nf 1/1 2/2 4/3\nf 1/1 4/3 3/2\nf 2/1 3/2 4/3\n";
+        fs::write(inner.join("thing.obj"), obj).expect("written");
+        for (name, value) in [("inner/thing.png", 200_u8), ("wall.png", 40)] {
+            let pixels: Vec<u8> = (0..16 * 16 * 3).map(|i| value.wrapping_add(i as u8)).collect();
+            image::save_buffer(folder.path().join(name), &pixels, 16, 16, image::ExtendedColorType::Rgb8)
+                .expect("written");
+        }
+        fs::write(folder.path().join("notes.txt"), "not for us").expect("written");
+        let mut library = Library::default();
+        library.add_folder(folder.path()).expect("a library");
+        assert_eq!(library.counts(), (1, 1));
+        let scan = &library.meshes[0];
+        assert!(scan.texture.is_some() && scan.size == 1.0 && scan.uv_per_length > 0.1);
+        let options = TrainingOptions { width: 64, height: 48, views: 2, setting: Some(Setting::Objects) };
+        let changed = (0..3)
+            .any(|seed| training_sample_with(seed, &options, &library) != training_sample(seed, &options));
+        assert!(changed, "the library is not used");
+    }
+
+    #[test]
+    fn folders_without_use_and_damaged_files_are_named() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let mut library = Library::default();
+        assert!(matches!(library.add_folder(folder.path()), Err(LibraryError::Nothing { .. })));
+        assert!(matches!(library.add_folder(&folder.path().join("none")), Err(LibraryError::List { .. })));
+        fs::write(folder.path().join("wall.png"), "no picture").expect("written");
+        assert!(matches!(library.add_folder(folder.path()), Err(LibraryError::Texture { .. })));
+        fs::write(folder.path().join("broken.ply"), "no mesh").expect("written");
+        assert!(matches!(library.add_folder(folder.path()), Err(LibraryError::Mesh(_))));
+    }
+}

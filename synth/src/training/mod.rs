@@ -1,6 +1,7 @@
 //! Endless training data: a seed gives photographs of a scene that nobody saw before, and its depth.
 
 mod draw;
+mod export;
 mod film;
 mod indoors;
 mod library;
@@ -23,6 +24,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
+pub use export::write_training_sample;
 pub use library::{Library, LibraryError};
 pub use settings::Setting;
 
