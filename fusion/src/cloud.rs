@@ -1,13 +1,14 @@
 //! Points of the dense cloud.
 
 use nalgebra::Point2;
+use planesweep_scene::Raster;
 use rayon::prelude::*;
 
 use crate::filter::FilteredMap;
 use crate::normals::normals;
 
 /// A point of the dense cloud.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Point {
     /// Position in the world, in scene units; `f64`, for world coordinates may be large.
     pub position: [f64; 3],
@@ -15,21 +16,30 @@ pub struct Point {
     pub normal: [f32; 3],
     /// RGB.
     pub color: [u8; 3],
+    /// Mean confidence of the views that agree on it, in [0, 1]; 0 when unknown.
+    pub confidence: f32,
+    /// How many views agree on it, 255 meaning that or more; 0 when unknown.
+    pub views: u8,
 }
 
-/// The points of a filtered depth map, row by row from the top.
-pub fn emit(map: &FilteredMap) -> Vec<Point> {
+/// The points of the pixels of a filtered depth map that `emitted` marks (of its size; see
+/// [`emitted`](crate::emitted)), row by row from the top.
+pub fn emit(map: &FilteredMap, emitted: &Raster<bool>) -> Vec<Point> {
     let normals = normals(&map.camera, &map.depth);
     let rows: Vec<Vec<Point>> = (0..map.depth.height())
         .into_par_iter()
         .map(|y| {
-            let pixels = map.depth.row(y).iter().zip(normals.row(y)).zip(map.color.row(y)).enumerate();
-            pixels
-                .filter(|(_, ((depth, _), _))| **depth > 0.0)
-                .map(|(x, ((depth, normal), color))| {
+            let emitted = emitted.row(y).iter().enumerate().filter(|(_, emitted)| **emitted);
+            emitted
+                .map(|(x, _)| {
                     let pixel = Point2::new(x as f64, y as f64);
-                    let position = map.camera.unproject(&pixel, *depth as f64).into();
-                    Point { position, normal: *normal, color: *color }
+                    Point {
+                        position: map.camera.unproject(&pixel, map.depth.at(x, y) as f64).into(),
+                        normal: normals.at(x, y),
+                        color: map.color.at(x, y),
+                        confidence: map.confidence.at(x, y) as f32 / 255.0,
+                        views: map.views.at(x, y),
+                    }
                 })
                 .collect()
         })
@@ -43,6 +53,7 @@ mod tests {
     use crate::analytic::{Surface, camera_at};
     use crate::filter::filter;
     use crate::options::FilterOptions;
+    use crate::surface::emitted;
 
     #[test]
     fn kept_pixels_become_points_of_the_surface_in_row_order() {
@@ -50,7 +61,8 @@ mod tests {
         let mut map = Surface::Plane { slope }.map(camera_at(0.2, 0.1, 12, 9));
         map.depth.values_mut()[5] = 0.0;
         let filtered = filter(&map, &[], &FilterOptions { min_views: 1, ..FilterOptions::default() });
-        let points = emit(&filtered);
+        let kept = emitted(&filtered, &[], 0.01);
+        let points = emit(&filtered, &kept);
         assert_eq!(points.len() as u64, filtered.funnel.geometric);
         assert_eq!(points.len(), 12 * 9 - 1);
         for point in &points {
@@ -60,5 +72,6 @@ mod tests {
         let last = map.camera.unproject(&Point2::new(11.0, 8.0), map.depth.at(11, 8) as f64);
         assert!((last.x - points[106].position[0]).abs() < 1e-9);
         assert_eq!(points[5].color, map.color.at(6, 0));
+        assert_eq!((points[5].confidence, points[5].views), (1.0, 1));
     }
 }

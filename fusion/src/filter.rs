@@ -6,10 +6,17 @@ use planesweep_scene::{Camera, DepthMap, Raster};
 use rayon::prelude::*;
 
 use crate::color::{ColorSum, add_color, color_sum, mean_color};
+use crate::dynamic::Settlement;
 use crate::funnel::Funnel;
 use crate::geometric::{Agreement, Neighbour};
-use crate::options::FilterOptions;
-use crate::photometric::ConfidentRow;
+use crate::hypotheses::HypothesisRow;
+use crate::options::{FilterOptions, FusionMethod};
+use crate::photometric::confident_depths;
+use crate::surface::Claim;
+use crate::visibility::{Candidates, Scratch};
+
+/// Neighbours whose agreement [`FilteredMap::agreeing`] can record.
+pub const MAX_RECORDED: usize = u64::BITS as usize;
 
 /// What the filter left of a depth map; all rasters have the size of its camera.
 #[derive(Clone, Debug, PartialEq)]
@@ -21,20 +28,33 @@ pub struct FilteredMap {
     /// Mean colour of the views that agree; black where the pixel was dropped.
     pub color: Raster<[u8; 3]>,
     /// How many views agree, the reference included, 255 meaning that or more; counted for dropped
-    /// pixels too, 0 where there is no confident depth.
+    /// pixels too, 0 where there is nothing to agree with.
     pub views: Raster<u8>,
-    /// How many pixels each step left.
+    /// Mean confidence of the views that agree, in 255ths; 0 where the pixel was dropped.
+    pub confidence: Raster<u8>,
+    /// Which neighbours agree: bit k is the one at index k, as far as there are bits; 0 where the
+    /// pixel was dropped.
+    pub agreeing: Raster<u64>,
+    /// Whether the pixel owns its surface: no confident view that agrees sees it with a smaller
+    /// footprint. False where the pixel was dropped.
+    pub owns: Raster<bool>,
+    /// How many pixels each step left; `emitted` is 0 yet.
     pub funnel: Funnel,
 }
 
-/// Filters a depth map against those of its neighbours (paper, section 4.2).
+/// Filters a depth map against those of its neighbours, by the method of the options (paper, section
+/// 4.2; DESIGN section 6).
 ///
-/// A pixel is kept when its confidence is at least [`FilterOptions::min_confidence`] and at least
-/// [`FilterOptions::min_views`] views, the reference included, agree with its depth. A neighbour
-/// agrees when its depth at the projection of the pixel, projected back, comes closer to the pixel
-/// than [`FilterOptions::max_reprojection_px`] and closer to its depth than
-/// [`FilterOptions::max_relative_depth`]. The neighbours' confidence plays no part, as in the common
-/// scripts. The maps may be of different sizes.
+/// A *hypothesis* is tested for each pixel: with [`FusionMethod::Consistency`] and
+/// [`FusionMethod::Dynamic`] the pixel's own depth, if its confidence is at least
+/// [`FilterOptions::min_confidence`]; with the visibility methods one of the confident depths of all views
+/// that lie along the pixel's line of sight, so that a pixel without a depth may get one.
+///
+/// A pixel is kept when at least [`FilterOptions::min_views`] views, the reference included, agree
+/// with the hypothesis. A neighbour agrees when its depth at the projection of the hypothesis, projected
+/// back, comes closer to the pixel than [`FilterOptions::max_reprojection_px`] and closer to its depth
+/// than [`FilterOptions::max_relative_depth`]. The neighbours' confidence plays no part in that, as in
+/// the common scripts. The maps may be of different sizes.
 ///
 /// Rows are computed in parallel; the result has the same bits for any number of threads.
 ///
@@ -43,22 +63,48 @@ pub struct FilteredMap {
 pub fn filter(reference: &DepthMap, neighbours: &[&DepthMap], options: &FilterOptions) -> FilteredMap {
     let (width, height) = (reference.width(), reference.height());
     let neighbours: Vec<_> = neighbours.iter().map(|map| Neighbour::new(&reference.camera, map)).collect();
+    let candidates = match options.method {
+        FusionMethod::Consistency | FusionMethod::Dynamic => None,
+        FusionMethod::Visibility | FusionMethod::VisibilityConfidence => {
+            Some(Candidates::new(reference, &neighbours, options))
+        }
+    };
+    let input = Input { reference, neighbours: &neighbours, candidates: candidates.as_ref(), options };
     let mut depth = Raster::filled(width, height, 0.0);
     let mut color = Raster::filled(width, height, [0; 3]);
     let mut views = Raster::filled(width, height, 0);
+    let mut confidence = Raster::filled(width, height, 0);
+    let mut agreeing = Raster::filled(width, height, 0);
+    let mut owns = Raster::filled(width, height, false);
     let columns = width.max(1); // a chunk of an empty map
     let rows = depth
         .values_mut()
         .par_chunks_exact_mut(columns)
         .zip(color.values_mut().par_chunks_exact_mut(columns))
-        .zip(views.values_mut().par_chunks_exact_mut(columns));
+        .zip(views.values_mut().par_chunks_exact_mut(columns))
+        .zip(confidence.values_mut().par_chunks_exact_mut(columns))
+        .zip(agreeing.values_mut().par_chunks_exact_mut(columns))
+        .zip(owns.values_mut().par_chunks_exact_mut(columns));
     let funnel = rows
         .enumerate()
-        .map_init(RowFilter::default, |row, (y, ((depth, color), views))| {
-            row.run(reference, &neighbours, options, y, &mut OutputRow { depth, color, views })
-        })
+        .map_init(
+            RowFilter::default,
+            |row, (y, (((((depth, color), views), confidence), agreeing), owns))| {
+                row.run(&input, y, &mut OutputRow { depth, color, views, confidence, agreeing, owns })
+            },
+        )
         .sum();
-    FilteredMap { camera: reference.camera, depth, color, views, funnel }
+    FilteredMap { camera: reference.camera, depth, color, views, confidence, agreeing, owns, funnel }
+}
+
+/// What all rows have in common.
+#[derive(Clone, Copy)]
+struct Input<'a> {
+    reference: &'a DepthMap,
+    neighbours: &'a [Neighbour<'a>],
+    /// With the visibility methods.
+    candidates: Option<&'a Candidates<'a>>,
+    options: &'a FilterOptions,
 }
 
 /// A row of each raster of the result, all zeros at first.
@@ -66,85 +112,86 @@ struct OutputRow<'a> {
     depth: &'a mut [f32],
     color: &'a mut [[u8; 3]],
     views: &'a mut [u8],
+    confidence: &'a mut [u8],
+    agreeing: &'a mut [u64],
+    owns: &'a mut [bool],
 }
 
 /// The filter of one row, with the memory it uses again for the next.
 #[derive(Default)]
 struct RowFilter {
-    confident: ConfidentRow,
+    scratch: Scratch,
+    settlement: Settlement,
+    hypotheses: HypothesisRow,
     /// By neighbour.
     agreements: Vec<Agreement>,
-    /// Sum of the agreeing depths and their number, by confident pixel.
+    /// Sum of the agreeing depths and their number, by hypothesis.
     sums: Vec<f32>,
     counts: Vec<u32>,
-    /// The confident pixels that enough views agree with, and their colours.
+    /// The hypotheses that enough views agree with, and what is known of each.
     kept: Vec<u32>,
     colors: Vec<ColorSum>,
+    confidences: Vec<f32>,
+    agreeing: Vec<u64>,
+    owns: Vec<bool>,
 }
 
 impl RowFilter {
-    fn run(
-        &mut self,
-        reference: &DepthMap,
-        neighbours: &[Neighbour<'_>],
-        options: &FilterOptions,
-        y: usize,
-        out: &mut OutputRow<'_>,
-    ) -> Funnel {
+    fn run(&mut self, input: &Input<'_>, y: usize, out: &mut OutputRow<'_>) -> Funnel {
         #[cfg(target_arch = "x86_64")]
         if is_x86_feature_detected!("avx2") {
             // SAFETY: the processor has AVX2, as just checked.
             #[allow(unsafe_code)]
-            return unsafe { self.run_avx2(reference, neighbours, options, y, out) };
+            return unsafe { self.run_avx2(input, y, out) };
         }
-        self.run_any(reference, neighbours, options, y, out)
+        self.run_any(input, y, out)
     }
 
     /// The same operations in wider registers. None of them is fused, so the bits are the same.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    fn run_avx2(
-        &mut self,
-        reference: &DepthMap,
-        neighbours: &[Neighbour<'_>],
-        options: &FilterOptions,
-        y: usize,
-        out: &mut OutputRow<'_>,
-    ) -> Funnel {
-        self.run_any(reference, neighbours, options, y, out)
+    fn run_avx2(&mut self, input: &Input<'_>, y: usize, out: &mut OutputRow<'_>) -> Funnel {
+        self.run_any(input, y, out)
     }
 
     #[inline(always)]
-    fn run_any(
-        &mut self,
-        reference: &DepthMap,
-        neighbours: &[Neighbour<'_>],
-        options: &FilterOptions,
-        y: usize,
-        out: &mut OutputRow<'_>,
-    ) -> Funnel {
-        self.confident.select(reference, y, options.min_confidence);
+    fn run_any(&mut self, input: &Input<'_>, y: usize, out: &mut OutputRow<'_>) -> Funnel {
+        let Input { reference, neighbours, candidates, options } = *input;
+        let (with_depth, photometric) = if let Some(candidates) = candidates {
+            let counts = candidates.choose(y, &mut self.scratch, &mut self.hypotheses);
+            (counts.with_depth, counts.photometric)
+        } else {
+            let with_depth = confident_depths(reference, y, options.min_confidence, &mut self.hypotheses);
+            (with_depth, self.hypotheses.depths.len())
+        };
         self.agreements.resize_with(neighbours.len(), Agreement::default);
         for (neighbour, agreement) in neighbours.iter().zip(&mut self.agreements) {
-            neighbour.agreement(&self.confident, y, options, agreement);
+            neighbour.agreement(&self.hypotheses, y, options, agreement);
+        }
+        if options.method == FusionMethod::Dynamic {
+            let hypotheses = self.hypotheses.depths.len();
+            self.settlement.settle(&mut self.agreements, hypotheses, options.min_views.saturating_sub(1));
         }
         self.add_depths();
         self.keep(options.min_views);
         self.add_colors(reference, neighbours, y);
+        self.compete(reference, neighbours, options, y);
         self.write(out);
         Funnel {
             pixels: reference.width() as u64,
-            with_depth: self.confident.with_depth as u64,
-            photometric: self.confident.depths.len() as u64,
+            with_depth: with_depth as u64,
+            photometric: photometric as u64,
+            visible: self.hypotheses.depths.len() as u64,
             geometric: self.kept.len() as u64,
+            emitted: 0,
         }
     }
 
     #[inline(always)]
     fn add_depths(&mut self) {
-        self.sums.clone_from(&self.confident.depths);
+        self.sums.clone_from(&self.hypotheses.own);
         self.counts.clear();
-        self.counts.resize(self.sums.len(), 1);
+        self.counts.extend(self.sums.iter().map(|own| u32::from(*own > 0.0)));
         for agreement in &self.agreements {
             for ((sum, count), depth) in self.sums.iter_mut().zip(&mut self.counts).zip(&agreement.depth) {
                 *sum += depth;
@@ -155,17 +202,22 @@ impl RowFilter {
 
     #[inline(always)]
     fn keep(&mut self, min_views: u32) {
+        // Without any view there is no mean.
+        let least = min_views.max(1);
         self.kept.clear();
-        self.kept.extend((0_u32..).zip(&self.counts).filter(|(_, n)| **n >= min_views).map(|(i, _)| i));
+        self.kept.extend((0_u32..).zip(&self.counts).filter(|(_, n)| **n >= least).map(|(i, _)| i));
     }
 
     #[inline(always)]
     fn add_colors(&mut self, reference: &DepthMap, neighbours: &[Neighbour<'_>], y: usize) {
-        let own = reference.color.row(y);
-        let columns = &self.confident.columns;
+        let own_colors = reference.color.row(y);
+        let HypothesisRow { columns, own, .. } = &self.hypotheses;
         self.colors.clear();
-        self.colors.extend(self.kept.iter().map(|i| color_sum(own[columns[*i as usize] as usize])));
-        for (neighbour, Agreement { u, v, depth }) in neighbours.iter().zip(&self.agreements) {
+        self.colors.extend(self.kept.iter().map(|i| {
+            let i = *i as usize;
+            if own[i] > 0.0 { color_sum(own_colors[columns[i] as usize]) } else { ColorSum::default() }
+        }));
+        for (neighbour, Agreement { u, v, depth, .. }) in neighbours.iter().zip(&self.agreements) {
             for (i, color) in self.kept.iter().zip(&mut self.colors) {
                 let i = *i as usize;
                 if depth[i] > 0.0 {
@@ -175,16 +227,64 @@ impl RowFilter {
         }
     }
 
+    /// Sums the confidences of the views that agree, and finds out who owns the surface: agreeing views
+    /// that are not confident there will not emit it, so they do not compete.
+    #[inline(always)]
+    fn compete(
+        &mut self,
+        reference: &DepthMap,
+        neighbours: &[Neighbour<'_>],
+        options: &FilterOptions,
+        y: usize,
+    ) {
+        let claim = Claim::of(&reference.camera);
+        let confidences = reference.confidence.row(y);
+        let HypothesisRow { columns, depths, own } = &self.hypotheses;
+        self.confidences.clear();
+        self.confidences.extend(self.kept.iter().map(|i| {
+            let i = *i as usize;
+            if own[i] > 0.0 { confidences[columns[i] as usize] } else { 0.0 }
+        }));
+        self.owns.clear();
+        self.owns.resize(self.kept.len(), true);
+        self.agreeing.clear();
+        self.agreeing.resize(self.kept.len(), 0);
+        for (k, (neighbour, agreement)) in neighbours.iter().zip(&self.agreements).enumerate() {
+            let Agreement { u, v, depth, .. } = agreement;
+            let transfer = neighbour.row_transfer(y);
+            let others = Claim::of(&neighbour.map.camera);
+            let bit = 1_u64.checked_shl(k as u32).unwrap_or(0);
+            let map = &neighbour.map.confidence;
+            let (right, bottom) = (map.width().saturating_sub(1), map.height().saturating_sub(1));
+            for (slot, i) in self.kept.iter().enumerate() {
+                let i = *i as usize;
+                if depth[i] > 0.0 {
+                    // Agreeing projections lie within a pixel of the map.
+                    let (x, y) = ((u[i] + 0.5) as usize, (v[i] + 0.5) as usize);
+                    let confidence = map.at(x.min(right), y.min(bottom));
+                    self.confidences[slot] += confidence;
+                    self.agreeing[slot] |= bit;
+                    let (_, _, z) = transfer.project(columns[i], depths[i]);
+                    self.owns[slot] &=
+                        confidence < options.min_confidence || !others.beats(z, &claim, depths[i]);
+                }
+            }
+        }
+    }
+
     #[inline(always)]
     fn write(&self, out: &mut OutputRow<'_>) {
-        for (x, count) in self.confident.columns.iter().zip(&self.counts) {
+        for (x, count) in self.hypotheses.columns.iter().zip(&self.counts) {
             out.views[*x as usize] = (*count).min(255) as u8;
         }
-        for (i, color) in self.kept.iter().zip(&self.colors) {
+        for (slot, i) in self.kept.iter().enumerate() {
             let i = *i as usize;
-            let x = self.confident.columns[i] as usize;
+            let x = self.hypotheses.columns[i] as usize;
             out.depth[x] = self.sums[i] / self.counts[i] as f32;
-            out.color[x] = mean_color(color, self.counts[i]);
+            out.color[x] = mean_color(&self.colors[slot], self.counts[i]);
+            out.confidence[x] = (self.confidences[slot] / self.counts[i] as f32 * 255.0 + 0.5) as u8;
+            out.agreeing[x] = self.agreeing[slot];
+            out.owns[x] = self.owns[slot];
         }
     }
 }
@@ -200,6 +300,12 @@ mod tests {
     use crate::options::DepthSampling;
 
     const PLANE: Surface = Surface::Plane { slope: 0.2 };
+    const METHODS: [FusionMethod; 4] = [
+        FusionMethod::Consistency,
+        FusionMethod::Dynamic,
+        FusionMethod::Visibility,
+        FusionMethod::VisibilityConfidence,
+    ];
     const PLACES: [(f64, f64); 5] = [(0.0, 0.0), (0.4, 0.0), (-0.4, 0.1), (0.1, 0.4), (0.0, -0.3)];
 
     fn maps(surface: Surface) -> Vec<DepthMap> {
@@ -307,7 +413,8 @@ mod tests {
         empty.depth = Raster::filled(20, 16, 0.0);
         let filtered = filter(&reference, &[&away, &empty], &FilterOptions::default());
         assert!(filtered.views.values().iter().all(|views| *views == 1));
-        let funnel = Funnel { pixels: 320, with_depth: 320, photometric: 320, geometric: 0 };
+        let funnel =
+            Funnel { pixels: 320, with_depth: 320, photometric: 320, visible: 320, ..Funnel::default() };
         assert_eq!(filtered.funnel, funnel);
     }
 
@@ -442,7 +549,9 @@ mod tests {
                 pixels: maps[0].depth.values().len() as u64,
                 with_depth: count(&|x, y| maps[0].depth.at(x, y) > 0.0),
                 photometric: count(&|x, y| filtered.views.at(x, y) > 0),
+                visible: count(&|x, y| filtered.views.at(x, y) > 0),
                 geometric: count(&|x, y| filtered.depth.at(x, y) > 0.0),
+                emitted: 0,
             });
         }
 
@@ -459,6 +568,7 @@ mod tests {
             ], 36),
             depths in prop::collection::vec(prop_oneof![0.0..9.0_f32, Just(1e30_f32), Just(1e-30_f32)], 80),
             continuous in any::<bool>(),
+            method in prop::sample::select(&METHODS),
         ) {
             let map = |n: &[f64]| {
                 let mut map = PLANE.map(camera_at(0.0, 0.0, 10, 8));
@@ -472,7 +582,7 @@ mod tests {
             let sane = PLANE.map(camera_at(0.1, 0.1, 10, 8));
             let (first, second) = (map(&numbers[..18]), map(&numbers[18..]));
             let sampling = if continuous { DepthSampling::Continuous } else { DepthSampling::Bilinear };
-            let options = FilterOptions { min_views: 1, sampling, ..FilterOptions::default() };
+            let options = FilterOptions { method, min_views: 1, sampling, ..FilterOptions::default() };
             for (reference, neighbours) in [(&first, [&second, &sane]), (&sane, [&first, &second])] {
                 let filtered = filter(reference, &neighbours, &options);
                 prop_assert!(filtered.depth.values().iter().all(|d| d.is_finite() && *d >= 0.0));
@@ -485,13 +595,16 @@ mod tests {
         let noise: Vec<_> =
             (0..997).map(|i| ((i as f32 * 0.7).sin(), 0.75 + (i as f32).cos() / 4.0)).collect();
         let maps: Vec<_> = PLACES.iter().map(|(x, y)| noisy_map(camera_at(*x, *y, 61, 43), &noise)).collect();
-        let with = |threads| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
-            pool.install(|| filter_first(&maps, &FilterOptions::default()))
-        };
-        let one = with(1);
-        assert!(one.funnel.geometric > 100 && one.funnel.geometric < one.funnel.photometric);
-        assert_eq!(one, with(2));
+        for method in METHODS {
+            let with = |threads| {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+                pool.install(|| filter_first(&maps, &FilterOptions { method, ..FilterOptions::default() }))
+            };
+            let one = with(1);
+            let Funnel { photometric, geometric, .. } = one.funnel;
+            assert!(geometric > 10 && geometric < photometric, "{method:?}: {geometric} of {photometric}");
+            assert_eq!(one, with(2));
+        }
     }
 
     #[test]
@@ -499,18 +612,39 @@ mod tests {
         let noise: Vec<_> =
             (0..991).map(|i| ((i as f32 * 0.3).sin(), 0.75 + (i as f32).sin() / 4.0)).collect();
         let maps: Vec<_> = PLACES.iter().map(|(x, y)| noisy_map(camera_at(*x, *y, 61, 43), &noise)).collect();
-        let options = FilterOptions::default();
-        let dispatched = filter_first(&maps, &options);
         let neighbours: Vec<_> = maps[1..].iter().map(|map| Neighbour::new(&maps[0].camera, map)).collect();
-        let mut row = RowFilter::default();
-        for y in 0..43 {
-            let (mut depth, mut color, mut views) = ([0.0; 61], [[0; 3]; 61], [0; 61]);
-            let mut out = OutputRow { depth: &mut depth, color: &mut color, views: &mut views };
-            row.run_any(&maps[0], &neighbours, &options, y, &mut out);
-            assert_eq!(depth, dispatched.depth.row(y));
-            assert_eq!(color, dispatched.color.row(y));
-            assert_eq!(views, dispatched.views.row(y));
+        for method in METHODS {
+            let options = FilterOptions { method, ..FilterOptions::default() };
+            let dispatched = filter_first(&maps, &options);
+            let candidates = matches!(method, FusionMethod::Visibility | FusionMethod::VisibilityConfidence)
+                .then(|| Candidates::new(&maps[0], &neighbours, &options));
+            let input = Input {
+                reference: &maps[0],
+                neighbours: &neighbours,
+                candidates: candidates.as_ref(),
+                options: &options,
+            };
+            let mut row = RowFilter::default();
+            for y in 0..43 {
+                let (mut depth, mut color, mut views) = ([0.0; 61], [[0; 3]; 61], [0; 61]);
+                let (mut confidence, mut agreeing, mut owns) = ([0; 61], [0; 61], [false; 61]);
+                let mut out = OutputRow {
+                    depth: &mut depth,
+                    color: &mut color,
+                    views: &mut views,
+                    confidence: &mut confidence,
+                    agreeing: &mut agreeing,
+                    owns: &mut owns,
+                };
+                row.run_any(&input, y, &mut out);
+                assert_eq!(depth, dispatched.depth.row(y));
+                assert_eq!(color, dispatched.color.row(y));
+                assert_eq!(views, dispatched.views.row(y));
+                assert_eq!(confidence, dispatched.confidence.row(y));
+                assert_eq!(agreeing, dispatched.agreeing.row(y));
+                assert_eq!(owns, dispatched.owns.row(y));
+            }
+            assert!(dispatched.funnel.geometric > 100, "{method:?}");
         }
-        assert!(dispatched.funnel.geometric > 100);
     }
 }

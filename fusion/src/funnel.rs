@@ -1,4 +1,4 @@
-//! How many pixels each step of the filter leaves.
+//! How many pixels each step of fusion leaves.
 
 use std::fmt;
 use std::iter::Sum;
@@ -16,8 +16,15 @@ pub struct Funnel {
     pub with_depth: u64,
     /// Of these, pixels that are confident enough.
     pub photometric: u64,
+    /// Of these, pixels with a depth that other views neither hide nor see through; all where the
+    /// method does not ask.
+    #[serde(default)]
+    pub visible: u64,
     /// Of these, pixels that enough views agree with.
     pub geometric: u64,
+    /// Of these, pixels that became points: what another view emits is left out.
+    #[serde(default)]
+    pub emitted: u64,
 }
 
 /// A step of the filter.
@@ -30,8 +37,12 @@ pub enum FilterStep {
     Depth,
     /// The pixel is confident.
     Photometric,
+    /// No view contradicts.
+    Visible,
     /// Enough views agree.
     Geometric,
+    /// No other view emits the same surface.
+    Emitted,
 }
 
 impl fmt::Display for FilterStep {
@@ -40,7 +51,9 @@ impl fmt::Display for FilterStep {
             Self::DepthMaps => "there is no depth map",
             Self::Depth => "no pixel has a depth",
             Self::Photometric => "no pixel passes the photometric filter (minimum confidence)",
+            Self::Visible => "no pixel passes the visibility filter (views that contradict)",
             Self::Geometric => "no pixel passes the geometric filter (views that agree)",
+            Self::Emitted => "no pixel is emitted",
         })
     }
 }
@@ -62,7 +75,9 @@ impl Funnel {
             (FilterStep::DepthMaps, self.pixels),
             (FilterStep::Depth, self.with_depth),
             (FilterStep::Photometric, self.photometric),
+            (FilterStep::Visible, self.visible),
             (FilterStep::Geometric, self.geometric),
+            (FilterStep::Emitted, self.emitted),
         ];
         let mut before = 0;
         for (step, left) in steps {
@@ -83,7 +98,9 @@ impl Add for Funnel {
             pixels: self.pixels + other.pixels,
             with_depth: self.with_depth + other.with_depth,
             photometric: self.photometric + other.photometric,
+            visible: self.visible + other.visible,
             geometric: self.geometric + other.geometric,
+            emitted: self.emitted + other.emitted,
         }
     }
 }
@@ -98,20 +115,26 @@ impl Sum for Funnel {
 mod tests {
     use super::*;
 
+    fn funnel(counts: [u64; 6]) -> Funnel {
+        let [pixels, with_depth, photometric, visible, geometric, emitted] = counts;
+        Funnel { pixels, with_depth, photometric, visible, geometric, emitted }
+    }
+
     #[test]
     fn the_first_step_that_left_nothing_is_named() {
-        let full = Funnel { pixels: 12, with_depth: 10, photometric: 5, geometric: 2 };
-        assert_eq!(full.emptied_by(), None);
+        assert_eq!(funnel([12, 10, 5, 4, 2, 1]).emptied_by(), None);
         let cases = [
-            (Funnel::default(), FilterStep::DepthMaps, 0),
-            (Funnel { pixels: 12, ..Funnel::default() }, FilterStep::Depth, 12),
-            (Funnel { photometric: 0, geometric: 0, ..full }, FilterStep::Photometric, 10),
-            (Funnel { geometric: 0, ..full }, FilterStep::Geometric, 5),
+            ([0; 6], FilterStep::DepthMaps, 0),
+            ([12, 0, 0, 0, 0, 0], FilterStep::Depth, 12),
+            ([12, 10, 0, 0, 0, 0], FilterStep::Photometric, 10),
+            ([12, 10, 5, 0, 0, 0], FilterStep::Visible, 5),
+            ([12, 10, 5, 4, 0, 0], FilterStep::Geometric, 4),
+            ([12, 10, 5, 4, 2, 0], FilterStep::Emitted, 2),
         ];
-        for (funnel, step, before) in cases {
-            assert_eq!(funnel.emptied_by(), Some(EmptyCloud { step, before }));
+        for (counts, step, before) in cases {
+            assert_eq!(funnel(counts).emptied_by(), Some(EmptyCloud { step, before }));
         }
-        let message = cases[3].0.emptied_by().expect("empty").to_string();
+        let message = funnel([12, 10, 5, 5, 0, 0]).emptied_by().expect("empty").to_string();
         assert_eq!(
             message,
             "the cloud is empty: no pixel passes the geometric filter (views that agree), 5 came that far"
@@ -120,10 +143,8 @@ mod tests {
 
     #[test]
     fn funnels_of_views_add_up() {
-        let one = Funnel { pixels: 12, with_depth: 10, photometric: 5, geometric: 2 };
-        let none = Funnel { pixels: 12, with_depth: 3, photometric: 1, geometric: 0 };
-        let sum: Funnel = [one, none].into_iter().sum();
-        assert_eq!(sum, Funnel { pixels: 24, with_depth: 13, photometric: 6, geometric: 2 });
+        let sum: Funnel = [funnel([12, 10, 5, 4, 2, 1]), funnel([12, 3, 1, 1, 0, 0])].into_iter().sum();
+        assert_eq!(sum, funnel([24, 13, 6, 5, 2, 1]));
         assert_eq!(sum.emptied_by(), None);
     }
 }

@@ -11,13 +11,14 @@
 use nalgebra::{Matrix3, Vector3};
 use planesweep_scene::{Camera, DepthMap, Intrinsics, Raster};
 
-use crate::options::{DepthSampling, FilterOptions};
-use crate::photometric::ConfidentRow;
+use crate::dynamic;
+use crate::hypotheses::HypothesisRow;
+use crate::options::{DepthSampling, FilterOptions, FusionMethod};
 
 /// Stands for a projection behind the camera: far enough outside every image to read nothing.
 const OUTSIDE: f32 = -2.0;
 
-/// What one neighbour says to the confident pixels of a row; index by index theirs.
+/// What one neighbour says to the hypotheses of a row; index by index theirs.
 #[derive(Default)]
 pub(crate) struct Agreement {
     /// Column of the projection into the neighbour.
@@ -26,6 +27,8 @@ pub(crate) struct Agreement {
     pub v: Vec<f32>,
     /// Depth of the reference that the neighbour's depth there amounts to; 0 where it disagrees.
     pub depth: Vec<f32>,
+    /// With [`FusionMethod::Dynamic`], the least n whose thresholds the neighbour meets.
+    pub level: Vec<f32>,
 }
 
 /// A neighbour as the criterion needs it.
@@ -36,6 +39,28 @@ pub(crate) struct Neighbour<'a> {
     back: Transfer,
 }
 
+/// From the pixels of one row of the reference to the pixels of a neighbour.
+#[derive(Clone, Copy)]
+pub(crate) struct RowTransfer {
+    along: [f32; 3],
+    start: [f32; 3],
+    shift: [f32; 3],
+}
+
+impl RowTransfer {
+    /// Column, row and depth in the neighbour of the pixel in column `x` with depth `d`; the first two
+    /// are [`OUTSIDE`] when it lies behind.
+    #[inline(always)]
+    pub fn project(&self, x: f32, d: f32) -> (f32, f32, f32) {
+        let Self { along, start, shift } = self;
+        let z = (along[2] * x + start[2]) * d + shift[2];
+        let scale = 1.0 / z;
+        let u = ((along[0] * x + start[0]) * d + shift[0]) * scale;
+        let v = ((along[1] * x + start[1]) * d + shift[1]) * scale;
+        (if z > 0.0 { u } else { OUTSIDE }, if z > 0.0 { v } else { OUTSIDE }, z)
+    }
+}
+
 impl<'a> Neighbour<'a> {
     /// Prepares `map` to be asked about pixels of `reference`.
     pub fn new(reference: &Camera, map: &'a DepthMap) -> Self {
@@ -44,9 +69,21 @@ impl<'a> Neighbour<'a> {
         Self { map, there, back }
     }
 
-    /// Asks about the confident pixels of row `y` of the reference.
+    /// The projection of row `y` of the reference into the neighbour.
     #[inline(always)]
-    pub fn agreement(&self, row: &ConfidentRow, y: usize, options: &FilterOptions, out: &mut Agreement) {
+    pub fn row_transfer(&self, y: usize) -> RowTransfer {
+        self.there.of_row(y)
+    }
+
+    /// The projection of row `y` of the neighbour into the reference.
+    #[inline(always)]
+    pub fn row_back(&self, y: usize) -> RowTransfer {
+        self.back.of_row(y)
+    }
+
+    /// Asks about the hypotheses of row `y` of the reference.
+    #[inline(always)]
+    pub fn agreement(&self, row: &HypothesisRow, y: usize, options: &FilterOptions, out: &mut Agreement) {
         let count = row.columns.len();
         for values in [&mut out.u, &mut out.v, &mut out.depth] {
             values.resize(count, 0.0);
@@ -66,59 +103,102 @@ impl<'a> Neighbour<'a> {
                 }
             }
         }
-        self.project_back(row, y, options, u, v, depth);
+        if options.method == FusionMethod::Dynamic {
+            out.level.resize(count, 0.0);
+            self.levels(row, y, u, v, depth, &mut out.level);
+        } else {
+            self.keep_agreeing(row, y, options, u, v, depth);
+        }
     }
 
-    /// Projects the pixels of row `y` into the neighbour.
+    /// Projects the hypotheses of row `y` into the neighbour.
     #[inline(always)]
-    fn project(&self, row: &ConfidentRow, y: usize, u: &mut [f32], v: &mut [f32]) {
-        let Transfer { matrix, vector } = &self.there;
-        let along: [f32; 3] = matrix.column(0).map(|m| m as f32).into();
-        let start: [f32; 3] = (matrix.column(1) * y as f64 + matrix.column(2)).map(|m| m as f32).into();
-        let shift: [f32; 3] = vector.map(|m| m as f32).into();
+    fn project(&self, row: &HypothesisRow, y: usize, u: &mut [f32], v: &mut [f32]) {
+        let transfer = self.row_transfer(y);
         let count = u.len();
         let (columns, depths, v) = (&row.columns[..count], &row.depths[..count], &mut v[..count]);
         for i in 0..count {
-            let (x, d) = (columns[i], depths[i]);
-            let z = (along[2] * x + start[2]) * d + shift[2];
-            let scale = 1.0 / z;
-            let pu = ((along[0] * x + start[0]) * d + shift[0]) * scale;
-            let pv = ((along[1] * x + start[1]) * d + shift[1]) * scale;
-            u[i] = if z > 0.0 { pu } else { OUTSIDE };
-            v[i] = if z > 0.0 { pv } else { OUTSIDE };
+            (u[i], v[i], _) = transfer.project(columns[i], depths[i]);
         }
     }
 
     /// Projects the neighbour's depths at `(u, v)` back and keeps those that agree.
     #[inline(always)]
-    fn project_back(
+    fn keep_agreeing(
         &self,
-        row: &ConfidentRow,
+        row: &HypothesisRow,
         y: usize,
         options: &FilterOptions,
         u: &[f32],
         v: &[f32],
         depth: &mut [f32],
     ) {
-        let m: [[f32; 3]; 3] = self.back.matrix.map(|m| m as f32).into(); // by columns
-        let shift: [f32; 3] = self.back.vector.map(|m| m as f32).into();
+        let back = Back::new(&self.back);
         let max_relative = options.max_relative_depth;
         let max_squared = options.max_reprojection_px * options.max_reprojection_px;
         let y = y as f32;
         let count = depth.len();
         let (columns, depths, u, v) = (&row.columns[..count], &row.depths[..count], &u[..count], &v[..count]);
         for i in 0..count {
-            let (x, d, seen) = (columns[i], depths[i], depth[i]);
-            let z = (m[0][2] * u[i] + m[1][2] * v[i] + m[2][2]) * seen + shift[2];
-            let scale = 1.0 / z;
-            let dx = ((m[0][0] * u[i] + m[1][0] * v[i] + m[2][0]) * seen + shift[0]) * scale - x;
-            let dy = ((m[0][1] * u[i] + m[1][1] * v[i] + m[2][1]) * seen + shift[1]) * scale - y;
+            let (z, squared) = back.pixel((u[i], v[i]), depth[i], (columns[i], y));
             // Without branches, so that the loop runs in vector registers.
-            let near = dx * dx + dy * dy < max_squared;
-            let alike = (z - d).abs() < max_relative * d;
-            let in_front = z.min(seen) > 0.0;
+            let near = squared < max_squared;
+            let alike = (z - depths[i]).abs() < max_relative * depths[i];
+            let in_front = z.min(depth[i]) > 0.0;
             depth[i] = if in_front & near & alike { z } else { 0.0 };
         }
+    }
+
+    /// Projects the neighbour's depths at `(u, v)` back and says how well each agrees.
+    #[inline(always)]
+    fn levels(
+        &self,
+        row: &HypothesisRow,
+        y: usize,
+        u: &[f32],
+        v: &[f32],
+        depth: &mut [f32],
+        level: &mut [f32],
+    ) {
+        let back = Back::new(&self.back);
+        let y = y as f32;
+        let count = depth.len();
+        let (columns, depths, u, v) = (&row.columns[..count], &row.depths[..count], &u[..count], &v[..count]);
+        let level = &mut level[..count];
+        for i in 0..count {
+            let (z, squared) = back.pixel((u[i], v[i]), depth[i], (columns[i], y));
+            let in_front = z.min(depth[i]) > 0.0;
+            level[i] = dynamic::level(squared, (z - depths[i]).abs() / depths[i]);
+            depth[i] = if in_front { z } else { 0.0 };
+        }
+    }
+}
+
+/// From a pixel of the neighbour to the reference, in `f32`.
+struct Back {
+    /// By columns.
+    matrix: [[f32; 3]; 3],
+    shift: [f32; 3],
+}
+
+impl Back {
+    fn new(transfer: &Transfer) -> Self {
+        Self {
+            matrix: transfer.matrix.map(|m| m as f32).into(),
+            shift: transfer.vector.map(|m| m as f32).into(),
+        }
+    }
+
+    /// Depth in the reference of the neighbour's pixel `(u, v)` with depth `seen`, and the square of
+    /// the distance at which it projects from pixel `(x, y)`.
+    #[inline(always)]
+    fn pixel(&self, (u, v): (f32, f32), seen: f32, (x, y): (f32, f32)) -> (f32, f32) {
+        let Self { matrix: m, shift } = self;
+        let z = (m[0][2] * u + m[1][2] * v + m[2][2]) * seen + shift[2];
+        let scale = 1.0 / z;
+        let dx = ((m[0][0] * u + m[1][0] * v + m[2][0]) * seen + shift[0]) * scale - x;
+        let dy = ((m[0][1] * u + m[1][1] * v + m[2][1]) * seen + shift[1]) * scale - y;
+        (z, dx * dx + dy * dy)
     }
 }
 
@@ -136,6 +216,15 @@ impl Transfer {
         Self {
             matrix: k * rotation * inverse(&from.intrinsics),
             vector: k * (to.pose.translation - rotation * from.pose.translation),
+        }
+    }
+
+    fn of_row(&self, y: usize) -> RowTransfer {
+        let Self { matrix, vector } = self;
+        RowTransfer {
+            along: matrix.column(0).map(|m| m as f32).into(),
+            start: (matrix.column(1) * y as f64 + matrix.column(2)).map(|m| m as f32).into(),
+            shift: vector.map(|m| m as f32).into(),
         }
     }
 }

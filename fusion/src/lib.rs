@@ -2,8 +2,10 @@
 //!
 //! In the order of the data (DESIGN section 6; paper, section 4.2):
 //!
-//! - [`filter`] drops the pixels of a reference view that are not confident or that too few of its
-//!   neighbours agree with, and averages depth and colour over the views that agree;
+//! - [`filter`] tests a depth for each pixel of a reference view, by one of the methods of
+//!   [`FusionMethod`]: it drops what too few of the neighbours agree with, and averages depth and colour
+//!   over the views that agree;
+//! - [`emitted`] leaves out what another view sees better, so that each surface is emitted once;
 //! - [`normals`] are the gradients of what is left;
 //! - [`emit`] makes points of it;
 //! - [`PlyWriter`] streams them to disk in the layout of COLMAP's `fused.ply`, [`read_ply`] reads
@@ -17,17 +19,22 @@
 mod analytic;
 mod cloud;
 mod color;
+mod dynamic;
 mod filter;
 mod funnel;
 mod geometric;
+mod hypotheses;
 mod normals;
 mod options;
 mod photometric;
 mod ply;
+mod surface;
+mod visibility;
 
 pub use cloud::{Point, emit};
-pub use filter::{FilteredMap, filter};
+pub use filter::{FilteredMap, MAX_RECORDED, filter};
 pub use funnel::{EmptyCloud, FilterStep, Funnel};
 pub use normals::normals;
-pub use options::{DepthSampling, FilterOptions};
+pub use options::{DepthSampling, FilterOptions, FusionMethod};
 pub use ply::{PlyError, PlyWriter, VERTEX_BYTES, encode, ply_header, read_ply};
+pub use surface::emitted;

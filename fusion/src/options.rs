@@ -2,9 +2,12 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Thresholds of the photometric and geometric filters (paper, section 4.2).
+/// How the depth maps are checked against each other, and by which thresholds (paper, section 4.2).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FilterOptions {
+    /// What decides whether a depth is kept.
+    #[serde(default)]
+    pub method: FusionMethod,
     /// Pixels with less confidence are dropped.
     pub min_confidence: f32,
     /// Largest distance between a pixel and its reprojection, exclusive, in pixels of the depth map.
@@ -22,6 +25,7 @@ pub struct FilterOptions {
 impl Default for FilterOptions {
     fn default() -> Self {
         Self {
+            method: FusionMethod::default(),
             min_confidence: 0.8,
             max_reprojection_px: 1.0,
             max_relative_depth: 0.01,
@@ -29,6 +33,27 @@ impl Default for FilterOptions {
             sampling: DepthSampling::default(),
         }
     }
+}
+
+/// What decides whether a depth is kept, and which.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FusionMethod {
+    /// Enough views agree with the reference's own depth (paper, section 4.2).
+    #[default]
+    Consistency,
+    /// As `Consistency`, with thresholds that relax as more views agree: n neighbours within n/4
+    /// pixels and n/1300 of the depth, for any n of at least `min_views` - 1 (D2HC-RMVSNet, Yan et al.
+    /// 2020). The two thresholds of [`FilterOptions`] play no part.
+    Dynamic,
+    /// The nearest of all views' depths that not more views see through than agree with it or have
+    /// something in front of it; at least `min_views` must agree with it (stability-based fusion,
+    /// Merrell et al. 2007).
+    Visibility,
+    /// The most confident of all views' depths, when the confidence of those that agree outweighs that
+    /// of those that contradict it by `min_confidence`; at least `min_views` must agree with it
+    /// (confidence-based fusion, Merrell et al. 2007).
+    VisibilityConfidence,
 }
 
 /// How a depth map is read between its pixels.

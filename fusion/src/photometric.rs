@@ -2,32 +2,26 @@
 
 use planesweep_scene::DepthMap;
 
-/// The pixels of one row that hold a confident depth, packed: what the geometric criterion runs over.
-#[derive(Default)]
-pub(crate) struct ConfidentRow {
-    /// Columns.
-    pub columns: Vec<f32>,
-    /// Their depths.
-    pub depths: Vec<f32>,
-    /// Pixels of the row with a depth, confident or not.
-    pub with_depth: usize,
-}
+use crate::hypotheses::HypothesisRow;
 
-impl ConfidentRow {
-    /// Packs row `y` of `map`, dropping what it held before.
-    pub fn select(&mut self, map: &DepthMap, y: usize, min_confidence: f32) {
-        self.columns.clear();
-        self.depths.clear();
-        self.with_depth = 0;
-        for (x, (&depth, &confidence)) in map.depth.row(y).iter().zip(map.confidence.row(y)).enumerate() {
-            let has_depth = depth > 0.0;
-            self.with_depth += usize::from(has_depth);
-            if has_depth && confidence >= min_confidence {
-                self.columns.push(x as f32);
-                self.depths.push(depth);
-            }
+/// Makes the confident depths of row `y` of `map` its hypotheses; returns how many pixels of the row
+/// have a depth, confident or not.
+pub(crate) fn confident_depths(
+    map: &DepthMap,
+    y: usize,
+    min_confidence: f32,
+    row: &mut HypothesisRow,
+) -> usize {
+    row.clear();
+    let mut with_depth = 0;
+    for (x, (&depth, &confidence)) in map.depth.row(y).iter().zip(map.confidence.row(y)).enumerate() {
+        let has_depth = depth > 0.0;
+        with_depth += usize::from(has_depth);
+        if has_depth && confidence >= min_confidence {
+            row.push(x, depth, depth);
         }
     }
+    with_depth
 }
 
 #[cfg(test)]
@@ -48,9 +42,9 @@ mod tests {
             Raster::filled(5, 2, [0; 3]),
         )
         .expect("sizes agree");
-        let mut row = ConfidentRow::default();
-        row.select(&map, 0, 0.8);
-        row.select(&map, 1, 0.8);
-        assert_eq!((row.columns, row.depths, row.with_depth), (vec![0.0, 3.0], vec![1.0, 4.0], 3));
+        let mut row = HypothesisRow::default();
+        confident_depths(&map, 0, 0.8, &mut row);
+        assert_eq!(confident_depths(&map, 1, 0.8, &mut row), 3);
+        assert_eq!((row.columns, row.depths, row.own), (vec![0.0, 3.0], vec![1.0, 4.0], vec![1.0, 4.0]));
     }
 }

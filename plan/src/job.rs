@@ -31,9 +31,9 @@ pub enum JobSpec {
     Infer(InferSpec),
     /// Puts the bands of a view's depth map together.
     Stitch(StitchSpec),
-    /// Filters the depth map of a view against those of its neighbours and merges agreeing depths.
+    /// Checks the depth map of a view against those of its neighbours and merges agreeing depths.
     Filter(FilterSpec),
-    /// Turns the filtered depth map of a view into points.
+    /// Turns the filtered depth map of a view into points, less what a neighbour emits.
     Emit(EmitSpec),
     /// Puts the points of all views together, in the order given.
     Assemble(AssembleSpec),
@@ -99,8 +99,10 @@ pub struct FilterSpec {
 pub struct EmitSpec {
     /// The reference view.
     pub view: ViewId,
-    /// The views that may emit the same surface.
+    /// The views that may emit the same surface; none when every view is to emit all it keeps.
     pub neighbours: Vec<ViewId>,
+    /// Two depths that differ by less, relatively, are the same surface.
+    pub max_relative_depth: f32,
 }
 
 /// The cloud. Needs the `Emit` jobs of all views, in order.

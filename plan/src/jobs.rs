@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use planesweep_fusion::DepthSampling;
+use planesweep_fusion::{DepthSampling, FusionMethod};
 use planesweep_scene::{Camera, DepthHypotheses, Sampling, Scene, ViewId};
 use thiserror::Error;
 
@@ -78,22 +78,27 @@ pub fn jobs(
         infer.extend(bands);
         stitch.push(whole);
     }
-    let by_neighbourhood =
-        |ids: &BTreeMap<ViewId, JobId>, spec: &dyn Fn(ViewId, Vec<ViewId>) -> JobSpec| -> Vec<Job> {
-            let of_view = plan.views.iter().map(|view| {
-                let neighbours: Vec<ViewId> =
-                    view.neighbours.iter().copied().filter(|n| ids.contains_key(n)).collect();
-                let needs = std::iter::once(&view.view).chain(&neighbours).map(|view| ids[view]).collect();
-                job(spec(view.view, neighbours), needs)
-            });
-            of_view.collect()
-        };
+    let by_neighbourhood = |ids: &BTreeMap<ViewId, JobId>,
+                            with_neighbours: bool,
+                            spec: &dyn Fn(ViewId, Vec<ViewId>) -> JobSpec|
+     -> Vec<Job> {
+        let of_view = plan.views.iter().map(|view| {
+            let known = view.neighbours.iter().copied().filter(|n| with_neighbours && ids.contains_key(n));
+            let neighbours: Vec<ViewId> = known.collect();
+            let needs = std::iter::once(&view.view).chain(&neighbours).map(|view| ids[view]).collect();
+            job(spec(view.view, neighbours), needs)
+        });
+        of_view.collect()
+    };
     let options = plan.options.filter;
-    let filter = by_neighbourhood(&maps, &|view, neighbours| {
+    let filter = by_neighbourhood(&maps, true, &|view, neighbours| {
         JobSpec::Filter(FilterSpec { view, neighbours, options })
     });
     let filtered = filter.iter().filter_map(|job| Some((job.spec.view()?, job.id))).collect();
-    let emit = by_neighbourhood(&filtered, &|view, neighbours| JobSpec::Emit(EmitSpec { view, neighbours }));
+    let max_relative_depth = options.max_relative_depth;
+    let emit = by_neighbourhood(&filtered, plan.options.once_per_surface, &|view, neighbours| {
+        JobSpec::Emit(EmitSpec { view, neighbours, max_relative_depth })
+    });
     // The cloud is in the order of view ids, which does not change when the plan's order does.
     let mut emitted: Vec<(ViewId, JobId)> =
         emit.iter().filter_map(|job| Some((job.spec.view()?, job.id))).collect();
@@ -124,6 +129,12 @@ fn job(spec: JobSpec, needs: Vec<JobId>) -> Job {
         }
         JobSpec::Filter(filter) => {
             let options = filter.options;
+            digest.u32(match options.method {
+                FusionMethod::Consistency => 0,
+                FusionMethod::Dynamic => 1,
+                FusionMethod::Visibility => 2,
+                FusionMethod::VisibilityConfidence => 3,
+            });
             digest.f64(options.min_confidence as f64);
             digest.f64(options.max_reprojection_px as f64);
             digest.f64(options.max_relative_depth as f64);
@@ -133,7 +144,8 @@ fn job(spec: JobSpec, needs: Vec<JobId>) -> Job {
                 DepthSampling::Continuous => 1,
             });
         }
-        JobSpec::Stitch(_) | JobSpec::Emit(_) | JobSpec::Assemble(_) => {}
+        JobSpec::Emit(emit) => digest.f64(emit.max_relative_depth as f64),
+        JobSpec::Stitch(_) | JobSpec::Assemble(_) => {}
     }
     digest.u32(needs.len() as u32);
     for need in &needs {
@@ -262,6 +274,11 @@ mod tests {
         let (kept, fresh): (Vec<&Job>, Vec<&Job>) =
             other_filter.iter().partition(|job| ids(&plain).contains(&job.id));
         assert!(kept.iter().all(|job| job.spec.kind() == "infer") && kept.len() == 4 && fresh.len() == 9);
+
+        let every_view = PlanOptions { once_per_surface: false, ..PlanOptions::default() };
+        let every_view = jobs_of(&scene(), &every_view, b"w");
+        assert_eq!(ids(&plain).intersection(&ids(&every_view)).count(), 8, "inference and filter stay");
+        assert!(every_view[8..12].iter().all(|job| job.needs.len() == 1));
 
         let mut bent = scene();
         bent.views.get_mut(&ViewId(0)).expect("exists").distortion = Distortion::Radial { k1: 0.1, k2: 0.0 };

@@ -42,8 +42,11 @@ pub struct PlanOptions {
     /// band computes besides is about 120 rows on either side, so fewer than 512 rows waste work. Changes no
     /// bit of the result.
     pub band_rows: Option<u32>,
-    /// Thresholds of the filters.
+    /// How depth maps are checked against each other.
     pub filter: FilterOptions,
+    /// Whether a surface that several views see is emitted by one of them only.
+    #[serde(default)]
+    pub once_per_surface: bool,
 }
 
 impl Default for PlanOptions {
@@ -57,6 +60,7 @@ impl Default for PlanOptions {
             depth_range: None,
             band_rows: None,
             filter: FilterOptions::default(),
+            once_per_surface: true,
         }
     }
 }

@@ -149,7 +149,11 @@ mod tests {
         let job = |k: u32| {
             let mut id = [0; 32];
             id[..4].copy_from_slice(&k.to_be_bytes());
-            let spec = JobSpec::Emit(EmitSpec { view: ViewId(k), neighbours: vec![ViewId(1); 500] });
+            let spec = JobSpec::Emit(EmitSpec {
+                view: ViewId(k),
+                neighbours: vec![ViewId(1); 500],
+                max_relative_depth: 0.01,
+            });
             Job { id: JobId(id), spec, needs: vec![JobId([1; 32]); 500] }
         };
         let jobs: Vec<Job> = (0..200).map(job).collect();

@@ -75,18 +75,22 @@ pub struct Funnel {
     pub pixels: u64,
     /// Those of enough confidence.
     pub photometric: u64,
+    /// Those of them with a depth that no more views contradict than confirm; all where the method
+    /// of fusion does not ask.
+    pub visible: u64,
     /// Those of them on which enough views agree.
     pub geometric: u64,
-    /// Those of them that became points.
+    /// Those of them that became points: what another view emits is left out.
     pub emitted: u64,
 }
 
 impl Funnel {
     /// The steps in order, each with its name.
-    pub fn steps(&self) -> [(&'static str, u64); 4] {
+    pub fn steps(&self) -> [(&'static str, u64); 5] {
         [
             ("pixels", self.pixels),
             ("photometric", self.photometric),
+            ("visible", self.visible),
             ("geometric", self.geometric),
             ("emitted", self.emitted),
         ]
@@ -100,6 +104,7 @@ impl Add for Funnel {
         Self {
             pixels: self.pixels + other.pixels,
             photometric: self.photometric + other.photometric,
+            visible: self.visible + other.visible,
             geometric: self.geometric + other.geometric,
             emitted: self.emitted + other.emitted,
         }
@@ -157,6 +162,7 @@ pub(crate) mod tests {
             funnel: Funnel {
                 pixels: 62_208,
                 photometric,
+                visible: photometric,
                 geometric: photometric * 4 / 5,
                 emitted: photometric * 3 / 5,
             },
@@ -201,6 +207,6 @@ pub(crate) mod tests {
     #[test]
     fn funnels_add_up() {
         assert_eq!(sample().funnel().photometric, 91_000);
-        assert_eq!(sample().funnel().steps()[3], ("emitted", 54_600));
+        assert_eq!(sample().funnel().steps()[4], ("emitted", 54_600));
     }
 }

@@ -11,8 +11,8 @@ use planesweep_scene::{Camera, CameraError, DepthMap, DepthMapError, Intrinsics,
 use thiserror::Error;
 
 const DEPTH_MAP: [u8; 8] = *b"PSDEPTH1";
-const FILTERED_MAP: [u8; 8] = *b"PSFILTR1";
-const POINTS: [u8; 8] = *b"PSPOINT1";
+const FILTERED_MAP: [u8; 8] = *b"PSFILTR2";
+const POINTS: [u8; 8] = *b"PSPOINT2";
 /// Longest side of a map that is read; a header that says more is damaged.
 const MAX_SIDE: u32 = 1 << 17;
 
@@ -70,6 +70,9 @@ pub fn encode_filtered_map(map: &FilteredMap) -> Vec<u8> {
     put_floats(&mut bytes, map.depth.values());
     bytes.extend_from_slice(map.color.values().as_flattened());
     bytes.extend_from_slice(map.views.values());
+    bytes.extend_from_slice(map.confidence.values());
+    bytes.extend(map.agreeing.values().iter().flat_map(|bits| bits.to_le_bytes()));
+    bytes.extend(map.owns.values().iter().map(|owns| u8::from(*owns)));
     put_funnel(&mut bytes, &map.funnel);
     bytes
 }
@@ -82,9 +85,13 @@ pub fn decode_filtered_map(bytes: &[u8]) -> Result<FilteredMap, BlobError> {
     let camera = reader.header(FILTERED_MAP, "filtered map", FILTERED_MAP_PIXEL_BYTES)?;
     let depth = reader.floats(&camera)?;
     let color = reader.colors(&camera)?;
-    let views = raster(&camera, reader.take(pixels_of(&camera))?.to_vec());
+    let views = reader.bytes_raster(&camera)?;
+    let confidence = reader.bytes_raster(&camera)?;
+    let (agreeing, _) = reader.take(8 * pixels_of(&camera))?.as_chunks::<8>();
+    let agreeing = raster(&camera, agreeing.iter().map(|bits| u64::from_le_bytes(*bits)).collect());
+    let owns = reader.bytes_raster(&camera)?.map(|owns| *owns != 0);
     let funnel = Reader { bytes: funnel, total: FUNNEL_BYTES }.funnel()?;
-    Ok(FilteredMap { camera, depth, color, views, funnel })
+    Ok(FilteredMap { camera, depth, color, views, confidence, agreeing, owns, funnel })
 }
 
 /// The points of one view as bytes: its funnel, then `vertices` as the PLY file will hold them.
@@ -116,10 +123,10 @@ pub fn decode_points(bytes: &[u8]) -> Result<&[u8], BlobError> {
 }
 
 const HEADER_BYTES: usize = 8 + 2 * 4 + (5 + 9 + 3) * 8;
-const FUNNEL_BYTES: usize = 4 * 8;
+const FUNNEL_BYTES: usize = 6 * 8;
 const POINTS_HEADER_BYTES: usize = 8 + FUNNEL_BYTES;
 const DEPTH_MAP_PIXEL_BYTES: usize = 4 + 4 + 3;
-const FILTERED_MAP_PIXEL_BYTES: usize = 4 + 3 + 1;
+const FILTERED_MAP_PIXEL_BYTES: usize = 4 + 3 + 1 + 1 + 8 + 1;
 
 fn put_header(bytes: &mut Vec<u8>, magic: [u8; 8], camera: &Camera) {
     let k = &camera.intrinsics;
@@ -138,8 +145,8 @@ fn put_floats(bytes: &mut Vec<u8>, values: &[f32]) {
 }
 
 fn put_funnel(bytes: &mut Vec<u8>, funnel: &Funnel) {
-    let Funnel { pixels, with_depth, photometric, geometric } = *funnel;
-    for count in [pixels, with_depth, photometric, geometric] {
+    let Funnel { pixels, with_depth, photometric, visible, geometric, emitted } = *funnel;
+    for count in [pixels, with_depth, photometric, visible, geometric, emitted] {
         bytes.extend_from_slice(&count.to_le_bytes());
     }
 }
@@ -187,9 +194,12 @@ impl<'a> Reader<'a> {
     }
 
     fn funnel(&mut self) -> Result<Funnel, BlobError> {
-        let [pixels, with_depth, photometric, geometric] =
-            [self.u64()?, self.u64()?, self.u64()?, self.u64()?];
-        Ok(Funnel { pixels, with_depth, photometric, geometric })
+        let mut counts = [0; 6];
+        for count in &mut counts {
+            *count = self.u64()?;
+        }
+        let [pixels, with_depth, photometric, visible, geometric, emitted] = counts;
+        Ok(Funnel { pixels, with_depth, photometric, visible, geometric, emitted })
     }
 
     /// Reads the header and checks that the rest is `pixel_bytes` for each pixel.
@@ -226,6 +236,10 @@ impl<'a> Reader<'a> {
         Ok(raster(camera, values.iter().map(|value| f32::from_le_bytes(*value)).collect()))
     }
 
+    fn bytes_raster(&mut self, camera: &Camera) -> Result<Raster<u8>, BlobError> {
+        Ok(raster(camera, self.take(pixels_of(camera))?.to_vec()))
+    }
+
     fn colors(&mut self, camera: &Camera) -> Result<Raster<[u8; 3]>, BlobError> {
         let (values, _) = self.take(3 * pixels_of(camera))?.as_chunks::<3>();
         Ok(raster(camera, values.to_vec()))
@@ -259,9 +273,23 @@ mod tests {
 
     fn filtered_map() -> FilteredMap {
         let map = depth_map();
-        let funnel = Funnel { pixels: 48, with_depth: 47, photometric: 20, geometric: 9 };
-        let views = Raster::from_fn(8, 6, |x, _| x as u8);
-        FilteredMap { camera: map.camera, depth: map.depth, color: map.color, views, funnel }
+        FilteredMap {
+            camera: map.camera,
+            depth: map.depth,
+            color: map.color,
+            views: Raster::from_fn(8, 6, |x, _| x as u8),
+            confidence: Raster::from_fn(8, 6, |_, y| y as u8),
+            agreeing: Raster::from_fn(8, 6, |x, y| 1 << (8 * y + x)),
+            owns: Raster::from_fn(8, 6, |x, y| x > y),
+            funnel: Funnel {
+                pixels: 48,
+                with_depth: 47,
+                photometric: 20,
+                visible: 19,
+                geometric: 9,
+                emitted: 3,
+            },
+        }
     }
 
     #[test]

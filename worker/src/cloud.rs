@@ -20,7 +20,7 @@ pub(crate) fn assemble(clouds: &[(JobId, Bytes)]) -> Result<(Vec<u8>, u64), JobE
     }
     let points: u64 = vertices.iter().map(|v| (v.len() / VERTEX_BYTES) as u64).sum();
     if points == 0 {
-        let nothing = EmptyCloud { step: FilterStep::Geometric, before: funnel.photometric };
+        let nothing = EmptyCloud { step: FilterStep::Emitted, before: funnel.geometric };
         return Err(funnel.emptied_by().unwrap_or(nothing).into());
     }
     let mut ply = ply_header(points).into_bytes();
@@ -38,7 +38,8 @@ mod tests {
 
     #[test]
     fn points_stand_in_the_order_of_the_views() {
-        let funnel = Funnel { pixels: 9, with_depth: 9, photometric: 3, geometric: 2 };
+        let funnel =
+            Funnel { pixels: 9, with_depth: 9, photometric: 3, visible: 3, geometric: 2, emitted: 2 };
         let view =
             |value: u8| (JobId([value; 32]), encode_points(&funnel, &[value; 2 * VERTEX_BYTES]).into());
         let (ply, points) = assemble(&[view(1), view(2)]).expect("four points");
@@ -53,7 +54,7 @@ mod tests {
 
     #[test]
     fn an_empty_cloud_names_the_step_that_emptied_it() {
-        let funnel = Funnel { pixels: 9, with_depth: 9, photometric: 0, geometric: 0 };
+        let funnel = Funnel { pixels: 9, with_depth: 9, ..Funnel::default() };
         let error = assemble(&[(JobId([1; 32]), encode_points(&funnel, &[]).into())]).expect_err("no points");
         assert!(error.to_string().contains("photometric"), "{error}");
         assert!(assemble(&[]).is_err());

@@ -110,7 +110,7 @@ mod tests {
         Grant {
             job: JobId([job; 32]),
             attempt: Attempt(1),
-            spec: JobSpec::Emit(EmitSpec { view: ViewId(0), neighbours: vec![] }),
+            spec: JobSpec::Emit(EmitSpec { view: ViewId(0), neighbours: vec![], max_relative_depth: 0.01 }),
             inputs: vec![],
         }
     }

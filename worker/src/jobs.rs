@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use bytes::Bytes;
-use planesweep_fusion::{FilteredMap, Funnel, VERTEX_BYTES, emit, encode, filter};
-use planesweep_plan::{BlobKey, FilterSpec, InferSpec, JobId, JobSpec};
+use planesweep_fusion::{FilteredMap, Funnel, emit, emitted, encode, filter};
+use planesweep_plan::{BlobKey, EmitSpec, FilterSpec, InferSpec, JobId, JobSpec};
 use planesweep_proto::{Grant, Input, Success};
 use planesweep_scene::DepthMap;
 use quick_cache::Weighter;
@@ -16,8 +16,7 @@ use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
 use crate::blob::{
-    decode_depth_map, decode_filtered_map, decode_points, encode_depth_map, encode_filtered_map,
-    encode_points,
+    decode_depth_map, decode_filtered_map, encode_depth_map, encode_filtered_map, encode_points,
 };
 use crate::cache::cache;
 use crate::cloud::assemble;
@@ -35,6 +34,12 @@ impl Weighter<BlobKey, Arc<DepthMap>> for ByPixels {
     }
 }
 
+impl Weighter<BlobKey, Arc<FilteredMap>> for ByPixels {
+    fn weight(&self, _: &BlobKey, map: &Arc<FilteredMap>) -> u64 {
+        map.depth.values().len() as u64 * 18
+    }
+}
+
 /// All that jobs share on a worker.
 pub(crate) struct Jobs {
     store: Store,
@@ -43,13 +48,14 @@ pub(crate) struct Jobs {
     /// One inference at a time; the next one loads its images meanwhile.
     device_turn: Semaphore,
     maps: Cache<BlobKey, Arc<DepthMap>, ByPixels>,
+    filtered: Cache<BlobKey, Arc<FilteredMap>, ByPixels>,
 }
 
 /// The bytes of a result and what was measured on the way.
 type Made = (Vec<u8>, BTreeMap<String, f64>);
 
 impl Jobs {
-    /// `cache_bytes` is the budget of images in memory, and of depth maps, each.
+    /// `cache_bytes` is the budget of images in memory, of depth maps, and of filtered ones, each.
     pub fn new(store: Store, device: Device, cache_bytes: u64) -> Self {
         Self {
             store,
@@ -57,6 +63,7 @@ impl Jobs {
             device,
             device_turn: Semaphore::new(1),
             maps: cache(cache_bytes, ByPixels),
+            filtered: cache(cache_bytes, ByPixels),
         }
     }
 
@@ -79,9 +86,9 @@ impl Jobs {
                 started();
                 self.filter(spec, &grant.inputs).await?
             }
-            JobSpec::Emit(_) => {
+            JobSpec::Emit(spec) => {
                 started();
-                self.emit(&grant.inputs).await?
+                self.emit(spec, &grant.inputs).await?
             }
             JobSpec::Assemble(_) => {
                 started();
@@ -161,27 +168,39 @@ impl Jobs {
             filter(&reference, &neighbours, &options)
         })
         .await;
-        let Funnel { pixels, with_depth, photometric, geometric } = filtered.funnel;
+        let Funnel { pixels, with_depth, photometric, visible, geometric, .. } = filtered.funnel;
         let counts = [
             ("pixels", pixels),
             ("with_depth", with_depth),
             ("photometric", photometric),
+            ("visible", visible),
             ("geometric", geometric),
         ];
         let measurements = counts.map(|(name, count)| (name.to_owned(), count as f64)).into();
-        Ok((encode_filtered_map(&filtered), measurements))
+        let filtered = Arc::new(filtered);
+        let bytes = encode_filtered_map(&filtered);
+        // Neighbouring views ask soon who emits what: keep it.
+        self.filtered.insert(BlobKey::of(&bytes), filtered);
+        Ok((bytes, measurements))
     }
 
-    async fn emit(&self, inputs: &[Input]) -> Result<Made, JobError> {
-        let own = inputs.first().ok_or(JobError::NoDepthMap)?;
-        let bytes = self.input(own).await?.ok_or(JobError::NoDepthMap)?;
-        let map: FilteredMap =
-            decode_filtered_map(&bytes).map_err(|source| JobError::Malformed { job: own.job, source })?;
-        let points = compute(move || encode_points(&map.funnel, &encode(&emit(&map)))).await;
-        let vertices =
-            decode_points(&points).map_err(|source| JobError::Malformed { job: own.job, source })?;
-        let count = vertices.len() / VERTEX_BYTES;
-        Ok((points, BTreeMap::from([("points".to_owned(), count as f64)])))
+    async fn emit(&self, spec: &EmitSpec, inputs: &[Input]) -> Result<Made, JobError> {
+        let mut maps = Vec::with_capacity(inputs.len());
+        for input in inputs {
+            maps.push(self.filtered_map(input).await);
+        }
+        let mut maps = all_or_lost(maps)?.into_iter();
+        let map = maps.next().flatten().ok_or(JobError::NoDepthMap)?;
+        let others: Vec<Arc<FilteredMap>> = maps.flatten().collect();
+        let max_relative_depth = spec.max_relative_depth;
+        let (funnel, vertices) = compute(move || {
+            let others: Vec<&FilteredMap> = others.iter().map(AsRef::as_ref).collect();
+            let points = emit(&map, &emitted(&map, &others, max_relative_depth));
+            (Funnel { emitted: points.len() as u64, ..map.funnel }, encode(&points))
+        })
+        .await;
+        let measurements = BTreeMap::from([("points".to_owned(), funnel.emitted as f64)]);
+        Ok((encode_points(&funnel, &vertices), measurements))
     }
 
     async fn assemble(&self, inputs: &[Input]) -> Result<Made, JobError> {
@@ -216,6 +235,17 @@ impl Jobs {
             Ok(Arc::new(map))
         };
         self.maps.get_or_insert_async(&produced.blob, read).await.map(Some)
+    }
+
+    async fn filtered_map(&self, input: &Input) -> Result<Option<Arc<FilteredMap>>, JobError> {
+        let Some(produced) = &input.produced else { return Ok(None) };
+        let read = async {
+            let bytes = self.input(input).await?.unwrap_or_default();
+            let map = decode_filtered_map(&bytes)
+                .map_err(|source| JobError::Malformed { job: input.job, source })?;
+            Ok(Arc::new(map))
+        };
+        self.filtered.get_or_insert_async(&produced.blob, read).await.map(Some)
     }
 }
 

@@ -1,7 +1,7 @@
 //! What a pixel must satisfy.
 
-use clap::Args;
-use planesweep_fusion::{DepthSampling, FilterOptions};
+use clap::{Args, ValueEnum};
+use planesweep_fusion::{DepthSampling, FilterOptions, FusionMethod};
 
 use super::values::{positive, share};
 
@@ -9,11 +9,14 @@ use super::values::{positive, share};
 #[derive(Clone, Copy, Debug, Args)]
 #[command(next_help_heading = "Fusion")]
 pub struct FilterArgs {
+    /// What decides whether a depth is kept.
+    #[arg(long, value_enum, default_value = "consistency")]
+    pub fusion: FusionArg,
     /// Drop pixels with less confidence.
     #[arg(long, default_value_t = 0.8, value_parser = share)]
     pub min_confidence: f32,
     /// Views that must agree on a depth, the reference included. The paper says three; scripts that
-    /// ask for three source views mean 4 here.
+    /// ask for three source views mean 4 here. With dynamic consistency, the fewest that may agree.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=255))]
     pub min_views: u32,
     /// Largest reprojection error, in pixels of the depth map.
@@ -29,12 +32,41 @@ pub struct FilterArgs {
     /// Views that a depth map is checked against.
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub fusion_views: u32,
+    /// Emit a surface from every view that keeps it, not only from the one that sees it best.
+    #[arg(long)]
+    pub every_view: bool,
+}
+
+/// [`FusionMethod`] on the command line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum FusionArg {
+    /// The nearest depth that not more views see through than it is hidden from (stability-based,
+    /// Merrell et al.).
+    Visibility,
+    /// The most confident depth whose supporters outweigh its opponents (confidence-based).
+    VisibilityConfidence,
+    /// The view's own depth, if enough views agree (the paper's filter).
+    Consistency,
+    /// The same with thresholds that relax as more views agree.
+    Dynamic,
+}
+
+impl From<FusionArg> for FusionMethod {
+    fn from(arg: FusionArg) -> Self {
+        match arg {
+            FusionArg::Visibility => Self::Visibility,
+            FusionArg::VisibilityConfidence => Self::VisibilityConfidence,
+            FusionArg::Consistency => Self::Consistency,
+            FusionArg::Dynamic => Self::Dynamic,
+        }
+    }
 }
 
 impl FilterArgs {
     /// As fusion wants it.
     pub fn options(&self) -> FilterOptions {
         FilterOptions {
+            method: self.fusion.into(),
             min_confidence: self.min_confidence,
             min_views: self.min_views,
             max_reprojection_px: self.max_reprojection,

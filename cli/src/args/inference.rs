@@ -80,6 +80,7 @@ impl PlanArgs {
             depth_range: self.depth_range,
             band_rows: self.band_rows,
             filter: filter.map_or(defaults.filter, FilterArgs::options),
+            once_per_surface: filter.map_or(defaults.once_per_surface, |f| !f.every_view),
         }
     }
 }

@@ -167,7 +167,13 @@ fn export_view(run: &Finished<'_>, out: &OutFolder, plan: &ViewPlan) -> Result<O
         let filtered =
             decode_filtered_map(&bytes).with_context(|| format!("cannot read the mask of {}", view.name))?;
         kept = filtered.depth.map(|depth| *depth > 0.0);
-        (funnel.photometric, funnel.geometric) = (filtered.funnel.photometric, filtered.funnel.geometric);
+        let left = filtered.funnel;
+        funnel = Funnel {
+            photometric: left.photometric,
+            visible: left.visible,
+            geometric: left.geometric,
+            ..funnel
+        };
     }
     let emit = run.result("emit", Some(plan.view));
     funnel.emitted = emit.and_then(|r| r.measurements.get("points")).map_or(0, |points| *points as u64);
@@ -307,6 +313,8 @@ fn report(
         ("longest side in pixels", json!(options.max_size)),
         ("depth hypotheses", options.depths.map_or(json!("by resolution"), |depths| json!(depths))),
         ("sampling", json!(options.sampling)),
+        ("fusion", json!(filter.method)),
+        ("each surface is emitted once", json!(options.once_per_surface)),
         ("confidence threshold", json!(filter.min_confidence)),
         ("views that must agree, reference included", json!(filter.min_views)),
         ("reprojection threshold in pixels of the depth map", json!(filter.max_reprojection_px)),

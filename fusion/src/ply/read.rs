@@ -233,6 +233,7 @@ impl Header {
             position: [values[0], values[1], values[2]],
             normal: [values[3] as f32, values[4] as f32, values[5] as f32],
             color,
+            ..Point::default()
         }
     }
 }
@@ -325,7 +326,7 @@ mod tests {
     fn binary_properties_come_in_any_order_and_type() {
         let body = [binary_vertex(1.5, -2, 3.25, [1, 2, 3]), binary_vertex(0.0, 9, 1e9, [4, 5, 6])].concat();
         let points = read_bytes(&[BINARY.as_bytes(), &body].concat()).expect("well-formed");
-        let point = |position, color| Point { position, normal: [0.0; 3], color };
+        let point = |position, color| Point { position, color, ..Point::default() };
         assert_eq!(points, [point([1.5, -2.0, 3.25], [1, 2, 3]), point([0.0, 9.0, 1e9], [4, 5, 6])]);
     }
 
@@ -338,7 +339,12 @@ mod tests {
         assert_eq!(points.len(), 2);
         assert_eq!(
             points[0],
-            Point { position: [1.0, 2.0, 3.0], normal: [0.0, 0.0, -1.0], color: [128, 0, 0] }
+            Point {
+                position: [1.0, 2.0, 3.0],
+                normal: [0.0, 0.0, -1.0],
+                color: [128, 0, 0],
+                ..Point::default()
+            }
         );
         assert_eq!(points[1].color, [255, 0, 0]);
     }

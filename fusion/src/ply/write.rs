@@ -119,6 +119,7 @@ mod tests {
                 position: [i as f64, -0.5, 1e6],
                 normal: [0.0, 0.6, -0.8],
                 color: [i as u8, 128, 255],
+                ..Point::default()
             })
             .collect()
     }

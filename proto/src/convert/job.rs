@@ -5,7 +5,7 @@ use std::os::unix::ffi::{OsStrExt, OsStringExt};
 use std::path::PathBuf;
 
 use nalgebra::{Matrix3, Vector3};
-use planesweep_fusion::{DepthSampling, FilterOptions};
+use planesweep_fusion::{DepthSampling, FilterOptions, FusionMethod};
 use planesweep_plan::{
     AssembleSpec, BlobKey, EmitSpec, FilterSpec, ImageSpec, InferSpec, Job, JobId, JobSpec, StitchSpec,
 };
@@ -71,9 +71,11 @@ impl From<&JobSpec> for wire::JobSpec {
                     neighbours: numbers(&spec.neighbours),
                     options: Some(spec.options.into()),
                 }),
-                JobSpec::Emit(spec) => {
-                    Spec::Emit(wire::EmitSpec { view: spec.view.0, neighbours: numbers(&spec.neighbours) })
-                }
+                JobSpec::Emit(spec) => Spec::Emit(wire::EmitSpec {
+                    view: spec.view.0,
+                    neighbours: numbers(&spec.neighbours),
+                    max_relative_depth: spec.max_relative_depth,
+                }),
                 JobSpec::Assemble(spec) => Spec::Assemble(wire::AssembleSpec { views: numbers(&spec.views) }),
             }),
         }
@@ -96,6 +98,7 @@ impl TryFrom<wire::JobSpec> for JobSpec {
             Spec::Emit(spec) => Self::Emit(EmitSpec {
                 view: ViewId(spec.view),
                 neighbours: views("neighbours", spec.neighbours)?,
+                max_relative_depth: threshold("max_relative_depth", spec.max_relative_depth)?,
             }),
             Spec::Assemble(spec) => Self::Assemble(AssembleSpec { views: views("views", spec.views)? }),
         })
@@ -323,13 +326,29 @@ impl From<FilterOptions> for wire::FilterOptions {
             DepthSampling::Bilinear => wire::DepthSampling::Bilinear,
             DepthSampling::Continuous => wire::DepthSampling::Continuous,
         };
+        let method = match options.method {
+            FusionMethod::Consistency => wire::FusionMethod::Consistency,
+            FusionMethod::Dynamic => wire::FusionMethod::Dynamic,
+            FusionMethod::Visibility => wire::FusionMethod::Visibility,
+            FusionMethod::VisibilityConfidence => wire::FusionMethod::VisibilityConfidence,
+        };
         Self {
             min_confidence: options.min_confidence,
             max_reprojection_px: options.max_reprojection_px,
             max_relative_depth: options.max_relative_depth,
             min_views: options.min_views,
             sampling: sampling.into(),
+            method: method.into(),
         }
+    }
+}
+
+/// A threshold; it may be infinite, which switches a criterion off.
+fn threshold(field: &'static str, value: f32) -> Result<f32, WireError> {
+    if value >= 0.0 {
+        Ok(value)
+    } else {
+        Err(WireError::BadNumber { field, value: value.into(), expected: "at least 0" })
     }
 }
 
@@ -337,14 +356,6 @@ impl TryFrom<wire::FilterOptions> for FilterOptions {
     type Error = WireError;
 
     fn try_from(options: wire::FilterOptions) -> Result<Self, WireError> {
-        // Thresholds may be infinite: that switches a criterion off.
-        let threshold = |field, value: f32| {
-            if value >= 0.0 {
-                Ok(value)
-            } else {
-                Err(WireError::BadNumber { field, value: value.into(), expected: "at least 0" })
-            }
-        };
         Ok(Self {
             min_confidence: threshold("min_confidence", options.min_confidence)?,
             max_reprojection_px: threshold("max_reprojection_px", options.max_reprojection_px)?,
@@ -355,6 +366,13 @@ impl TryFrom<wire::FilterOptions> for FilterOptions {
                 Ok(wire::DepthSampling::Continuous) => DepthSampling::Continuous,
                 _ => return Err(WireError::UnknownValue { field: "sampling", value: options.sampling }),
             },
+            method: match wire::FusionMethod::try_from(options.method) {
+                Ok(wire::FusionMethod::Consistency) => FusionMethod::Consistency,
+                Ok(wire::FusionMethod::Dynamic) => FusionMethod::Dynamic,
+                Ok(wire::FusionMethod::Visibility) => FusionMethod::Visibility,
+                Ok(wire::FusionMethod::VisibilityConfidence) => FusionMethod::VisibilityConfidence,
+                _ => return Err(WireError::UnknownValue { field: "method", value: options.method }),
+            },
         })
     }
 }
@@ -364,6 +382,7 @@ mod tests {
     use nalgebra::Rotation3;
     use proptest::collection::vec;
     use proptest::prelude::*;
+    use proptest::sample::select;
 
     use super::*;
 
@@ -437,13 +456,23 @@ mod tests {
     }
 
     fn options() -> impl Strategy<Value = FilterOptions> {
-        (0.0..=1.0_f32, 0.01..9.0_f32, 1e-4..0.5_f32, 1..9_u32, any::<bool>()).prop_map(
-            |(min_confidence, max_reprojection_px, max_relative_depth, min_views, plain)| FilterOptions {
-                min_confidence,
-                max_reprojection_px,
-                max_relative_depth,
-                min_views,
-                sampling: if plain { DepthSampling::Bilinear } else { DepthSampling::Continuous },
+        let methods = [
+            FusionMethod::Consistency,
+            FusionMethod::Dynamic,
+            FusionMethod::Visibility,
+            FusionMethod::VisibilityConfidence,
+        ];
+        let method = select(methods.to_vec());
+        (method, 0.0..=1.0_f32, 0.01..9.0_f32, 1e-4..0.5_f32, 1..9_u32, any::<bool>()).prop_map(
+            |(method, min_confidence, max_reprojection_px, max_relative_depth, min_views, plain)| {
+                FilterOptions {
+                    method,
+                    min_confidence,
+                    max_reprojection_px,
+                    max_relative_depth,
+                    min_views,
+                    sampling: if plain { DepthSampling::Bilinear } else { DepthSampling::Continuous },
+                }
             },
         )
     }
@@ -459,8 +488,9 @@ mod tests {
             infer().prop_map(JobSpec::Infer),
             any::<u32>().prop_map(|view| JobSpec::Stitch(StitchSpec { view: ViewId(view) })),
             filter().prop_map(JobSpec::Filter),
-            (any::<u32>(), view_list())
-                .prop_map(|(view, neighbours)| JobSpec::Emit(EmitSpec { view: ViewId(view), neighbours })),
+            (any::<u32>(), view_list(), 0.0..1.0_f32).prop_map(|(view, neighbours, max_relative_depth)| {
+                JobSpec::Emit(EmitSpec { view: ViewId(view), neighbours, max_relative_depth })
+            }),
             view_list().prop_map(|views| JobSpec::Assemble(AssembleSpec { views })),
         ];
         (any::<[u8; 32]>(), spec, vec(any::<[u8; 32]>(), 0..12)).prop_map(|(id, spec, needs)| Job {

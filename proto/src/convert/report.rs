@@ -388,7 +388,11 @@ mod tests {
     fn reply() -> impl Strategy<Value = ReportReply> {
         let grants = vec((job(), any::<u32>(), vec(input(), 0..4)), 0..3).prop_map(|grants| {
             let grant = |((job, attempt), view, inputs)| {
-                let spec = JobSpec::Emit(EmitSpec { view: ViewId(view), neighbours: vec![ViewId(2)] });
+                let spec = JobSpec::Emit(EmitSpec {
+                    view: ViewId(view),
+                    neighbours: vec![ViewId(2)],
+                    max_relative_depth: 0.01,
+                });
                 Grant { job, attempt, spec, inputs }
             };
             grants.into_iter().map(grant).collect()

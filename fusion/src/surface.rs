@@ -1,0 +1,87 @@
+//! Once per surface: of all views that see a place, which one emits it.
+//!
+//! Every view sees the place with pixels of some *footprint*, their width there in scene units. Pass one
+//! (part of the filter) lets a pixel *own* its place when no view that agrees with it sees the place
+//! with a smaller footprint. Pass two (before points are made) drops a pixel that owns nothing when
+//! a pixel of another view that does covers it.
+//!
+//! Owners are always emitted, and only what an owner covers is dropped: so no hole can appear, whatever
+//! the chain of views that defer to each other, and whatever the filters did to the best view. Where
+//! the best view's own pixel was dropped, the others emit theirs.
+
+#![allow(clippy::inline_always)] // a row's work is compiled once per instruction set
+
+use nalgebra::{Point2, Point3};
+use planesweep_scene::{Camera, Raster};
+use rayon::prelude::*;
+
+use crate::filter::FilteredMap;
+
+/// Footprints that differ by less than this are equal, so that both views see them so.
+const EQUAL_FOOTPRINTS: f32 = 1e-4;
+
+/// How a view competes with others for a place.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Claim {
+    /// Width of a pixel at depth 1.
+    pixel_width: f32,
+    /// Breaks ties, by coordinates: it stays the same when views are numbered anew.
+    centre: Point3<f64>,
+}
+
+impl Claim {
+    pub fn of(camera: &Camera) -> Self {
+        let k = &camera.intrinsics;
+        Self { pixel_width: (1.0 / (k.fx * k.fy).sqrt()) as f32, centre: camera.pose.centre() }
+    }
+
+    /// Whether this view's claim to a place at `depth` (in its own frame) is better than `other`'s,
+    /// who sees it at `other_depth`. Of two claims of views in different places one is better.
+    #[inline(always)]
+    pub fn beats(&self, depth: f32, other: &Self, other_depth: f32) -> bool {
+        let (footprint, others) = (depth * self.pixel_width, other_depth * other.pixel_width);
+        if (footprint - others).abs() < EQUAL_FOOTPRINTS * others {
+            let (a, b) = (&self.centre.coords, &other.centre.coords);
+            (a.x, a.y, a.z) < (b.x, b.y, b.z)
+        } else {
+            footprint < others
+        }
+    }
+}
+
+/// Which kept pixels of a map are to become points.
+///
+/// With `others`, the filtered maps of all views that may emit the same surface, a pixel is left out
+/// when it owns nothing and an owner among the others covers it: its surface point lies in the owner's
+/// pixel, and the depths there differ by less than `max_relative_depth`. Without, all kept pixels are
+/// emitted.
+pub fn emitted(map: &FilteredMap, others: &[&FilteredMap], max_relative_depth: f32) -> Raster<bool> {
+    let (width, height) = (map.depth.width(), map.depth.height());
+    let mut emitted = Raster::filled(width, height, false);
+    emitted.values_mut().par_chunks_mut(width.max(1)).enumerate().for_each(|(y, row)| {
+        for (x, emitted) in row.iter_mut().enumerate() {
+            let depth = map.depth.at(x, y);
+            *emitted = depth > 0.0
+                && (map.owns.at(x, y) || {
+                    let point = map.camera.unproject(&Point2::new(x as f64, y as f64), depth as f64);
+                    !others.iter().any(|other| covers(other, &point, max_relative_depth))
+                });
+        }
+    });
+    emitted
+}
+
+/// Whether a pixel of `map` that owns its surface has the point in it.
+fn covers(map: &FilteredMap, point: &Point3<f64>, max_relative_depth: f32) -> bool {
+    let Some((pixel, depth)) = map.camera.project(point) else { return false };
+    if !(pixel.x > -0.5 && pixel.y > -0.5) {
+        return false;
+    }
+    let (x, y) = ((pixel.x + 0.5) as usize, (pixel.y + 0.5) as usize);
+    let Some(seen) = map.depth.get(x, y) else { return false };
+    let difference = (seen as f64 - depth).abs();
+    map.owns.at(x, y) && seen > 0.0 && difference < max_relative_depth as f64 * depth
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,99 @@
+//! A neighbour's depth map as the reference sees it.
+
+use planesweep_scene::Raster;
+
+use super::Candidate;
+use crate::geometric::Neighbour;
+
+/// The nearest confident depth of one neighbour at each pixel of the reference.
+pub(crate) struct Rendered {
+    /// Depth in the reference; 0 where nothing of the neighbour lies.
+    depth: Raster<f32>,
+    confidence: Raster<f32>,
+}
+
+impl Rendered {
+    #[inline]
+    pub fn at(&self, x: usize, y: usize) -> Option<Candidate> {
+        let depth = self.depth.at(x, y);
+        (depth > 0.0).then(|| Candidate { depth, confidence: self.confidence.at(x, y) })
+    }
+}
+
+/// Draws each pixel of the neighbour with a confident depth into the pixel of the reference (of `width`
+/// by `height`) that its point lies in; the nearest wins.
+///
+/// Where the reference sees the surface larger than the neighbour does, pixels stay empty in between:
+/// they have one candidate less.
+pub(crate) fn render(
+    neighbour: &Neighbour<'_>,
+    width: usize,
+    height: usize,
+    min_confidence: f32,
+) -> Rendered {
+    let map = neighbour.map;
+    let mut depths = Raster::filled(width, height, 0.0_f32);
+    let mut confidences = Raster::filled(width, height, 0.0_f32);
+    for y in 0..map.height() {
+        let transfer = neighbour.row_back(y);
+        for (x, (&depth, &confidence)) in map.depth.row(y).iter().zip(map.confidence.row(y)).enumerate() {
+            if !(depth > 0.0 && confidence >= min_confidence) {
+                continue;
+            }
+            let (u, v, z) = transfer.project(x as f32, depth);
+            if !(u > -0.5 && v > -0.5 && u < width as f32 - 0.5 && v < height as f32 - 0.5 && z.is_finite()) {
+                continue;
+            }
+            let index = (v + 0.5) as usize * width + (u + 0.5) as usize;
+            let nearest = &mut depths.values_mut()[index];
+            if *nearest == 0.0 || z < *nearest {
+                *nearest = z;
+                confidences.values_mut()[index] = confidence;
+            }
+        }
+    }
+    Rendered { depth: depths, confidence: confidences }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::analytic::{Surface, camera_at};
+
+    #[test]
+    fn the_nearest_surface_is_seen_where_it_lies() {
+        let surface = Surface::BallBeforePlane;
+        let (reference, neighbour) =
+            (surface.map(camera_at(0.0, 0.0, 80, 60)), surface.map(camera_at(0.5, 0.1, 80, 60)));
+        let rendered = render(&Neighbour::new(&reference.camera, &neighbour), 80, 60, 0.8);
+        let (mut same, mut hidden) = (0, 0);
+        for y in 0..60 {
+            for x in 0..80 {
+                let Some(seen) = rendered.at(x, y) else { continue };
+                let truth = reference.depth.at(x, y);
+                assert_eq!(seen.confidence, 1.0);
+                // Half a pixel at the ball's edge is another surface; a pixel's rim is nearer than its
+                // centre.
+                same += usize::from((seen.depth - truth).abs() < 0.02 * truth);
+                hidden += usize::from(seen.depth > 1.1 * truth);
+            }
+        }
+        assert!(same > 3000, "{same}");
+        // What the neighbour sees beside the ball lies behind the ball for the reference, in a gap
+        // that no pixel of the ball falls into.
+        assert!(hidden < 60, "{hidden}");
+    }
+
+    #[test]
+    fn doubtful_depths_and_what_lies_outside_are_not_drawn() {
+        let mut map = Surface::Plane { slope: 0.0 }.map(camera_at(0.0, 0.0, 10, 8));
+        map.confidence = Raster::from_fn(10, 8, |x, _| if x < 5 { 0.7 } else { 0.9 });
+        let rendered = render(&Neighbour::new(&map.camera, &map), 10, 8, 0.8);
+        for x in 0..10 {
+            assert_eq!(rendered.at(x, 3).is_some(), x >= 5);
+        }
+        let away = camera_at(90.0, 0.0, 10, 8);
+        let rendered = render(&Neighbour::new(&away, &map), 10, 8, 0.0);
+        assert!(rendered.depth.values().iter().filter(|depth| **depth > 0.0).count() < 80);
+    }
+}
