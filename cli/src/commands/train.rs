@@ -7,8 +7,8 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use planesweep_mvsnet::Weights;
 use planesweep_mvsnet::train::{
-    GradientEngine, StepReport, TorchEngine, TrainConfig, TrainEvent, Trainer, Validation, ValidationSet,
-    Wish,
+    GradientEngine, KernelEngine, StepReport, TorchEngine, TrainConfig, TrainEvent, Trainer, Validation,
+    ValidationSet, Wish,
 };
 use planesweep_scene::write_atomically;
 use serde_json::json;
@@ -142,7 +142,8 @@ fn read_config(path: &Path) -> Result<TrainConfig> {
 
 fn engine(config: &TrainConfig) -> Result<Box<dyn GradientEngine>> {
     match config.device.as_str() {
-        "torch" | "cpu" => Ok(Box::new(TorchEngine::new("cpu", config.threads)?)),
+        "cpu" => Ok(Box::new(KernelEngine::new(config.threads)?)),
+        "torch" => Ok(Box::new(TorchEngine::new("cpu", config.threads)?)),
         name if name.starts_with("cuda") => Ok(Box::new(TorchEngine::new(name, config.threads)?)),
         name => bail!("device \"{name}\" is none of cpu, torch, cuda and cuda:N"),
     }

@@ -268,7 +268,7 @@ impl UpStage {
 }
 
 /// The inputs that an output of a transposed layer is made of, each with its tap.
-fn taps(output: usize, inputs: usize) -> impl Iterator<Item = (usize, usize)> {
+pub(crate) fn taps(output: usize, inputs: usize) -> impl Iterator<Item = (usize, usize)> {
     let i = output / 2;
     let all = if output.is_multiple_of(2) { [Some((i, 1)), None] } else { [Some((i, 2)), Some((i + 1, 0))] };
     all.into_iter().flatten().filter(move |(input, _)| *input < inputs)

@@ -55,13 +55,17 @@ impl FeatureMap {
         self.height
     }
 
+    pub(super) fn values(&self) -> &[f32] {
+        self.data.values()
+    }
+
     /// Bytes it holds.
     pub(crate) fn bytes(&self) -> usize {
         size_of_val(self.data.values())
     }
 
     /// From a row to the next, in pixels.
-    fn pitch(&self) -> usize {
+    pub(super) fn pitch(&self) -> usize {
         self.width + 2
     }
 }
@@ -72,8 +76,8 @@ impl FeatureMap {
 /// equation 1 with its slips put right. The third component is the depth in the source divided by `d`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PixelSweep {
-    rotation: Matrix3<f64>,
-    offset: Vector3<f64>,
+    pub(super) rotation: Matrix3<f64>,
+    pub(super) offset: Vector3<f64>,
 }
 
 impl PixelSweep {
@@ -98,11 +102,22 @@ pub(crate) struct CostInput<'a> {
 /// Where each depth of one pixel lies in one source: the pixel above and left of it in the bordered map (the bits of
 /// a `u32`), then the bilinear weights of that pixel and of those right, below, and right below, which are zero
 /// outside; five parts, each of the padded number of depths.
-type Samples = Vec<f32>;
+pub(super) type Samples = Vec<f32>;
 
 /// Memory for the samples of one pixel.
 #[derive(Debug, Default)]
 pub(crate) struct CostScratch(Vec<Samples>);
+
+impl CostScratch {
+    /// For this many sources and (padded) depths.
+    pub(super) fn samples(&mut self, sources: usize, padded: usize) -> &mut [Samples] {
+        self.0.resize_with(sources, Samples::default);
+        for samples in &mut self.0 {
+            samples.resize(5 * padded, 0.0);
+        }
+        &mut self.0
+    }
+}
 
 impl CostInput<'_> {
     /// The cost at one pixel and all depths: one column of a slab of 32 channels.
@@ -119,11 +134,8 @@ impl CostInput<'_> {
     ) {
         let shape = Shape { columns: 1, channels: CHANNELS, length: self.inverse_depths.len() };
         assert!(x < self.reference.width && y < self.reference.height && output.len() == shape.column());
-        scratch.0.resize_with(self.sources.len(), Samples::default);
-        for samples in &mut scratch.0 {
-            samples.resize(5 * shape.padded(), 0.0);
-        }
-        run(level, &mut Task { input: self, x, y, shape, output, samples: &mut scratch.0 });
+        let samples = scratch.samples(self.sources.len(), shape.padded());
+        run(level, &mut Task { input: self, x, y, shape, output, samples });
     }
 }
 
@@ -202,7 +214,7 @@ unsafe fn column<S: Simd>(task: &mut Task<'_>) {
 /// None beyond the vectors' lengths, which are at least that of the depths; all positions written lie in the
 /// bordered map, with their neighbours right and below.
 #[inline(always)]
-unsafe fn locate(
+pub(super) unsafe fn locate(
     map: &FeatureMap,
     ray: Vector3<f64>,
     offset: Vector3<f64>,
@@ -240,7 +252,7 @@ unsafe fn locate(
 
 /// Transposes 16 x 16 values: each of four rounds rotates the eight bits of a value's place by one.
 #[inline(always)]
-unsafe fn transposed<S: Simd>(mut rows: [S::V; LANES]) -> [S::V; LANES] {
+pub(super) unsafe fn transposed<S: Simd>(mut rows: [S::V; LANES]) -> [S::V; LANES] {
     for _ in 0..4 {
         let mut next = rows;
         for i in 0..8 {

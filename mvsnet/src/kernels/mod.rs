@@ -11,7 +11,9 @@
 #![allow(clippy::needless_range_loop, reason = "indices name registers, and loops over them must unroll")]
 
 mod aligned;
+pub(crate) mod correlate;
 pub(crate) mod cost;
+pub(crate) mod cost_gradient;
 pub(crate) mod regress;
 pub(crate) mod simd;
 pub(crate) mod slab;

@@ -9,6 +9,7 @@ mod config;
 mod engine;
 mod example;
 mod feeder;
+mod network;
 mod optimizer;
 mod parameters;
 #[cfg(all(test, feature = "torch"))]
@@ -26,6 +27,7 @@ pub use config::{
 pub use engine::{BatchStatistics, EngineError, Gradient, GradientEngine, GradientOptions, IntervalErrors};
 pub use example::{Example, ExampleError, Recipe, SampleShape};
 pub use feeder::{FeedError, SampleError, SampleSource};
+pub use network::KernelEngine;
 pub use optimizer::{GradientNorm, TrainState};
 #[cfg(feature = "torch")]
 pub use torch_engine::TorchEngine;

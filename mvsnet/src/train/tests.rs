@@ -85,3 +85,55 @@ fn autograd_agrees_with_finite_differences() {
         assert!((measured / expected - 1.0).abs() < 0.03, "{network:?}: {measured} instead of {expected}");
     }
 }
+
+#[test]
+fn kernels_agree_with_autograd() {
+    for (network, statistics, depths) in [
+        (ALL_NETWORKS[0], BatchStatistics::Own, 32),
+        (ALL_NETWORKS[1], BatchStatistics::Own, 24),
+        (ALL_NETWORKS[2], BatchStatistics::Own, 40),
+        (ALL_NETWORKS[1], BatchStatistics::Running, 8),
+    ] {
+        let (example, weights) = (example(network, depths), weights(network));
+        let options = options(network, statistics);
+        let exact = TorchEngine::exact().gradient(&weights, &example, &options).expect("a gradient");
+        let ours = KernelEngine::new(2).expect("threads").gradient(&weights, &example, &options);
+        let ours = ours.expect("a gradient");
+        assert!((ours.loss / exact.loss - 1.0).abs() < 1e-4, "loss {} and {}", ours.loss, exact.loss);
+        assert_eq!(ours.initial.pixels, exact.initial.pixels);
+        assert_eq!(ours.refined.is_some(), exact.refined.is_some());
+        for (kind, ours, exact) in
+            [("gradient", &ours.weights, &exact.weights), ("statistic", &ours.statistics, &exact.statistics)]
+        {
+            assert!(ours.keys().eq(exact.keys()), "{kind}: {:?}, {:?}", ours.keys(), exact.keys());
+            for (name, exact) in exact {
+                let difference = norm(exact.values.iter().zip(&ours[name].values).map(|(a, b)| a - b));
+                let scale = norm(exact.values.iter().copied());
+                assert_eq!(ours[name].shape, exact.shape);
+                assert!(
+                    difference <= 0.01 * scale + 1e-5,
+                    "{kind} of {name}: {difference} of {scale}, {network:?}"
+                );
+            }
+        }
+    }
+}
+
+fn norm(values: impl Iterator<Item = f32>) -> f64 {
+    values.map(|value| f64::from(value).powi(2)).sum::<f64>().sqrt()
+}
+
+#[test]
+fn threads_change_no_bit_of_a_gradient() {
+    let network = ALL_NETWORKS[1];
+    let (example, weights) = (example(network, 32), weights(network));
+    let options = options(network, BatchStatistics::Own);
+    let [one, three] = [1, 3].map(|threads| {
+        let mut engine = KernelEngine::new(threads).expect("threads");
+        let first = engine.gradient(&weights, &example, &options).expect("a gradient");
+        // Memory that was used before changes nothing either.
+        assert_eq!(engine.gradient(&weights, &example, &options).expect("a gradient"), first);
+        first
+    });
+    assert_eq!(one, three);
+}

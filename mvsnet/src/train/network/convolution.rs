@@ -1,0 +1,356 @@
+//! Convolutions forward, and what the gradient of their output says of input and kernel.
+
+use rayon::prelude::*;
+
+use super::stack::{Stack, Tools};
+use crate::WeightTensor;
+use crate::bands::{PlainStage, taps};
+use crate::kernels::correlate::{Correlation, OUTPUTS};
+use crate::kernels::slab::{Column, Shape};
+use crate::kernels::strided::StridedLayer;
+use crate::kernels::transposed::TransposedLayer;
+use crate::kernels::winograd::{Target, WinogradLayer};
+
+/// What a layer does with sizes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Sizes {
+    /// Keeps them; kernels of size 3.
+    Same,
+    /// Halves them; kernels of size 3 in volumes, 5 in images.
+    Halved,
+    /// Doubles them; kernels of size 3, of volumes.
+    Doubled,
+}
+
+/// A convolution of images or volumes with its kernel.
+#[derive(Debug)]
+pub(super) struct Convolution<'a> {
+    sizes: Sizes,
+    volume: bool,
+    kernel: &'a WeightTensor,
+    bias: Vec<f64>,
+    inputs: usize,
+    outputs: usize,
+    /// Size of the kernel along each axis.
+    size: usize,
+}
+
+impl<'a> Convolution<'a> {
+    pub(super) fn new(sizes: Sizes, kernel: &'a WeightTensor, bias: Option<&WeightTensor>) -> Self {
+        let shape = &kernel.shape;
+        let (outputs, inputs) =
+            if sizes == Sizes::Doubled { (shape[1], shape[0]) } else { (shape[0], shape[1]) };
+        let bias = bias.map_or_else(
+            || vec![0.0; outputs],
+            |bias| bias.values.iter().map(|value| f64::from(*value)).collect(),
+        );
+        Self { sizes, volume: shape.len() == 5, kernel, bias, inputs, outputs, size: shape[2] }
+    }
+
+    /// The kernel's value: output, input, row (of volumes), column, place along the contiguous axis.
+    fn weight(&self, output: usize, input: usize, row: usize, column: usize, k: usize) -> f64 {
+        f64::from(self.kernel.values[self.index(output, input, row, column, k)])
+    }
+
+    fn index(&self, output: usize, input: usize, row: usize, column: usize, k: usize) -> usize {
+        let pair = if self.sizes == Sizes::Doubled {
+            input * self.outputs + output
+        } else {
+            output * self.inputs + input
+        };
+        if self.volume {
+            // Kernels have depth first, rows of a volume are y, columns x, and depth is contiguous.
+            pair * 27 + k * 9 + row * 3 + column
+        } else {
+            (pair * self.size + column) * self.size + k
+        }
+    }
+
+    /// Rows of the kernel: one for images, whose columns are the rows.
+    fn rows(&self) -> usize {
+        if self.volume { 3 } else { 1 }
+    }
+
+    /// The shape of the output of an input, without the number of slabs.
+    fn output_shape(&self, from: Shape) -> Shape {
+        let channels = self.outputs;
+        match self.sizes {
+            Sizes::Same => Shape { channels: channels.next_multiple_of(8), ..from },
+            Sizes::Halved => Shape { columns: from.columns / 2, channels, length: from.length.div_ceil(2) },
+            Sizes::Doubled => Shape { columns: from.columns * 2, channels, length: from.length * 2 },
+        }
+    }
+
+    pub(super) fn forward(&self, tools: &Tools, input: &Stack) -> Stack {
+        match self.sizes {
+            Sizes::Same => {
+                let kernel = |o, i, row, column, k| self.weight(o, i, row, column, k);
+                let sizes = [self.inputs, self.outputs, self.rows()];
+                let layer = WinogradLayer::new(tools.level, sizes, kernel, &self.bias, false);
+                same(tools, &layer, input, self.volume)
+            }
+            Sizes::Halved => {
+                let kernel = |o, i, tap, k| self.weight(o, i, tap / 3, tap % 3, k);
+                let image_kernel = |o, i, tap, k| self.weight(o, i, 0, tap, k);
+                let (sizes, level) = ([self.inputs, self.outputs, self.taps(), self.size], tools.level);
+                let layer = if self.volume {
+                    StridedLayer::new(level, sizes, kernel, &self.bias, false)
+                } else {
+                    StridedLayer::new(level, sizes, image_kernel, &self.bias, false)
+                };
+                halved(tools, &layer, input, self.output_shape(input.shape), self.volume)
+            }
+            Sizes::Doubled => {
+                let kernel = |o, i, tap, k| self.weight(o, i, tap / 3, tap % 3, k);
+                let sizes = [self.inputs, self.outputs, 9, 3];
+                let layer = TransposedLayer::new(tools.level, sizes, kernel, &self.bias, false);
+                doubled(tools, &layer, input, None, self.output_shape(input.shape), true)
+            }
+        }
+    }
+
+    fn taps(&self) -> usize {
+        if self.volume { 9 } else { self.size }
+    }
+
+    /// The gradient of the input, of shape `to`, with `more` added, which it gets from elsewhere.
+    pub(super) fn input_gradient(
+        &self,
+        tools: &Tools,
+        gradient: &Stack,
+        to: Shape,
+        more: Option<&Stack>,
+    ) -> Stack {
+        match self.sizes {
+            Sizes::Same => {
+                let last = self.size - 1;
+                let kernel = |i, o, row, column, k| {
+                    if o >= self.outputs {
+                        return 0.0;
+                    }
+                    let row = if self.volume { last - row } else { 0 };
+                    self.weight(o, i, row, last - column, last - k)
+                };
+                let sizes = [gradient.shape.channels, self.inputs, self.rows()];
+                let bias = vec![0.0; self.inputs];
+                let layer = WinogradLayer::new(tools.level, sizes, kernel, &bias, false);
+                let mut result = same(tools, &layer, gradient, self.volume);
+                if let Some(more) = more {
+                    add(&mut result, more);
+                }
+                result
+            }
+            Sizes::Halved => {
+                let kernel = |i, o, tap, k| self.weight(o, i, tap / 3, tap % 3, k);
+                let image_kernel = |i, o, tap, k| self.weight(o, i, 0, tap, k);
+                let (sizes, level) = ([self.outputs, self.inputs, self.taps(), self.size], tools.level);
+                let bias = vec![0.0; self.inputs];
+                let layer = if self.volume {
+                    TransposedLayer::new(level, sizes, kernel, &bias, false)
+                } else {
+                    TransposedLayer::new(level, sizes, image_kernel, &bias, false)
+                };
+                doubled(tools, &layer, gradient, more, to, self.volume)
+            }
+            Sizes::Doubled => {
+                let kernel = |i, o, tap, k| self.weight(o, i, tap / 3, tap % 3, k);
+                let bias = vec![0.0; self.inputs];
+                let sizes = [self.outputs, self.inputs, 9, 3];
+                let layer = StridedLayer::new(tools.level, sizes, kernel, &bias, false);
+                halved(tools, &layer, gradient, to, true)
+            }
+        }
+    }
+
+    /// The gradient of the kernel.
+    pub(super) fn kernel_gradient(&self, tools: &Tools, input: &Stack, gradient: &Stack) -> WeightTensor {
+        // A doubling layer is a halving one with input and output exchanged; a kernel with few outputs is
+        // correlated the other way round, which mirrors its taps.
+        let exchanged = self.sizes == Sizes::Doubled;
+        let mirrored = !exchanged && !self.outputs.is_multiple_of(OUTPUTS);
+        let (coarse, fine) = if exchanged || mirrored { (input, gradient) } else { (gradient, input) };
+        let stride = if self.sizes == Sizes::Same { 1 } else { 2 };
+        let (blocks, others) = if exchanged || mirrored {
+            (self.inputs / OUTPUTS, self.outputs)
+        } else {
+            (self.outputs / OUTPUTS, self.inputs)
+        };
+        let vectors = coarse.slabs.len() * coarse.shape.columns * coarse.shape.length.div_ceil(16);
+        let strips = (vectors / 320).clamp(1, 24);
+        let (rows, columns, size) = (self.rows(), self.size, self.size);
+        let tasks: Vec<_> =
+            (0..strips).flat_map(|strip| (0..blocks).map(move |block| (strip, block))).collect();
+        let parts: Vec<Vec<f32>> = tasks
+            .par_iter()
+            .map(|(strip, block)| {
+                let mut all = Vec::with_capacity(rows * columns * fine.shape.channels * OUTPUTS * size);
+                for (row, column) in (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column))) {
+                    let pairs = self.pairs(coarse, fine, stride, [row, column], [*strip, strips]);
+                    let correlation = Correlation { pairs: &pairs, output: block * OUTPUTS, stride, size };
+                    let mut sums = correlation.sums(tools.level);
+                    sums.resize(fine.shape.channels * OUTPUTS * size, 0.0);
+                    all.extend(sums);
+                }
+                all
+            })
+            .collect();
+        let mut result =
+            WeightTensor { shape: self.kernel.shape.clone(), values: vec![0.0; self.kernel.values.len()] };
+        for ((_, block), part) in tasks.iter().zip(&parts) {
+            let mut sums = part.iter();
+            for (row, column) in (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column))) {
+                for other in 0..fine.shape.channels {
+                    for one in 0..OUTPUTS {
+                        for k in 0..size {
+                            let sum = sums.next().expect("a sum for each tap");
+                            if other >= others {
+                                continue;
+                            }
+                            let one = block * OUTPUTS + one;
+                            let at = if mirrored {
+                                let row = if self.volume { size - 1 - row } else { 0 };
+                                self.index(other, one, row, size - 1 - column, size - 1 - k)
+                            } else if exchanged {
+                                self.index(other, one, row, column, k)
+                            } else {
+                                self.index(one, other, row, column, k)
+                            };
+                            result.values[at] += sum;
+                        }
+                    }
+                }
+            }
+        }
+        result
+    }
+
+    /// Pairs of columns that meet at a row and column of the kernel, in one of some strips of the coarser stack.
+    fn pairs<'s>(
+        &self,
+        coarse: &'s Stack,
+        fine: &'s Stack,
+        stride: usize,
+        [row, column]: [usize; 2],
+        [strip, strips]: [usize; 2],
+    ) -> Vec<(Column<'s>, Column<'s>)> {
+        let columns = coarse.shape.columns;
+        let all = coarse.slabs.len() * columns;
+        let reach = (self.size / 2) as isize;
+        let mut pairs = Vec::new();
+        for at in strip * all / strips..(strip + 1) * all / strips {
+            let (slab, x) = (at / columns, at % columns);
+            let other = if self.volume { (stride * slab + row) as isize - 1 } else { slab as isize };
+            let fine_x = (stride * x + column) as isize - reach;
+            if !(0..fine.slabs.len() as isize).contains(&other)
+                || !(0..fine.shape.columns as isize).contains(&fine_x)
+            {
+                continue;
+            }
+            pairs.push((coarse.slabs[slab].column(x as isize), fine.slabs[other as usize].column(fine_x)));
+        }
+        pairs
+    }
+}
+
+/// The gradient of biases: sums over everything else.
+pub(super) fn bias_gradient(gradient: &Stack, outputs: usize) -> WeightTensor {
+    let per_slab: Vec<Vec<f64>> = gradient
+        .slabs
+        .par_iter()
+        .map(|slab| {
+            let channel = |channel| {
+                let columns = 0..gradient.shape.columns;
+                columns.map(|x| slab.channel(x, channel).iter().map(|v| f64::from(*v)).sum::<f64>()).sum()
+            };
+            (0..outputs).map(channel).collect()
+        })
+        .collect();
+    let total = |channel: usize| per_slab.iter().map(|sums| sums[channel]).sum::<f64>() as f32;
+    WeightTensor { shape: vec![outputs], values: (0..outputs).map(total).collect() }
+}
+
+fn add(to: &mut Stack, more: &Stack) {
+    let more = &more.slabs;
+    to.slabs_mut().enumerate().for_each(|(i, slab)| {
+        let shape = slab.shape();
+        for x in 0..shape.columns {
+            for channel in 0..shape.channels {
+                let from = more[i].channel(x, channel);
+                slab.channel_mut(x, channel).iter_mut().zip(from).for_each(|(to, from)| *to += from);
+            }
+        }
+    });
+}
+
+fn same(tools: &Tools, layer: &WinogradLayer, input: &Stack, volume: bool) -> Stack {
+    if volume {
+        let mut stage = PlainStage::new(&tools.pool, layer, input.shape, input.slabs.len());
+        return Stack::new(stage.push(layer, &input.slabs));
+    }
+    let shape = Shape { channels: layer.outputs, ..input.shape };
+    Stack::compute(tools, input.slabs.len(), shape, |i, slab| {
+        let input = &input.slabs[i];
+        let pairs = slab.columns_mut().par_chunks_mut(2 * shape.column()).enumerate();
+        pairs.with_min_len(2).for_each_init(
+            || layer.scratch(),
+            |scratch, (pair, columns)| {
+                let y = 2 * pair as isize;
+                let end = input.shape().columns as isize;
+                let input = [y - 1, y, y + 1, y + 2].map(|y| input.column(y.min(end)));
+                layer.accumulate(input, &mut [Target { columns, tap: 0, first: true, last: true }], scratch);
+            },
+        );
+    })
+}
+
+fn halved(tools: &Tools, layer: &StridedLayer, input: &Stack, to: Shape, volume: bool) -> Stack {
+    let count = if volume { input.slabs.len() / 2 } else { input.slabs.len() };
+    let (rows, size) = if volume { (3, 3) } else { (1, 5) };
+    Stack::compute_columns(tools, count, to, |i, x, output| {
+        let mut columns = Vec::with_capacity(9);
+        for row in 0..rows {
+            let slab = if volume { (2 * i + row).checked_sub(1) } else { Some(i) };
+            let Some(slab) = slab.and_then(|slab| input.slabs.get(slab)) else { continue };
+            for column in 0..size {
+                let at = (2 * x + column) as isize - size as isize / 2;
+                if (0..input.shape.columns as isize).contains(&at) {
+                    columns.push((slab.column(at), size * row + column));
+                }
+            }
+        }
+        layer.apply(&columns, output);
+    })
+}
+
+fn doubled(
+    tools: &Tools,
+    layer: &TransposedLayer,
+    input: &Stack,
+    more: Option<&Stack>,
+    to: Shape,
+    volume: bool,
+) -> Stack {
+    let count = if volume { 2 * input.slabs.len() } else { input.slabs.len() };
+    Stack::compute_columns(tools, count, to, |i, x, output| {
+        let mut columns = Vec::with_capacity(4);
+        if volume {
+            for (slab, row) in taps(i, input.slabs.len()) {
+                let slab = &input.slabs[slab];
+                columns.extend(
+                    taps(x, input.shape.columns)
+                        .map(|(x, column)| (slab.column(x as isize), 3 * row + column)),
+                );
+            }
+        } else {
+            // Output 2j + k - 2 gets input j at tap k.
+            for tap in (x % 2..5).step_by(2) {
+                let at = (x as isize + 2 - tap as isize) / 2;
+                if (0..input.shape.columns as isize).contains(&at) {
+                    columns.push((input.slabs[i].column(at), tap));
+                }
+            }
+        }
+        let skip = more.map(|more| more.slabs[i].column(x as isize));
+        layer.apply(&columns, skip, to.length, output);
+    })
+}
