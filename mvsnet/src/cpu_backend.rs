@@ -221,7 +221,9 @@ impl CpuBackend {
     ) -> Swept {
         let (width, height) = (cost.reference.width(), cost.reference.height());
         let (depths, views) = (cost.inverse_depths.len(), cost.sources.len() + 1);
-        let step_rows = self.step_rows(InferSize { width: 4 * width, height: 4 * height, depths, views });
+        let refined = self.refinement.is_some();
+        let size = InferSize { width: 4 * width, height: 4 * height, depths, views, refined };
+        let step_rows = self.step_rows(size);
         let needed = rows_for_depth(&rows, height);
         let mut volume = Regularization::new(
             &Arc::default(),
@@ -411,7 +413,7 @@ mod tests {
     fn little_memory_makes_smaller_steps_and_the_same_map() {
         let images = Images::new(128, 128, Sampling::Uniform);
         let weights = Weights::seeded(WeightsMetadata::untrained(Refinement::None), 3);
-        let size = InferSize { width: 128, height: 128, depths: 16, views: 3 };
+        let size = InferSize { width: 128, height: 128, depths: 16, views: 3, refined: false };
         let roomy = CpuBackend::new(&weights, 1, None).expect("threads").predict(size);
         let mut tight = CpuBackend::new(&weights, 1, Some(roomy.bytes - 1)).expect("threads");
         assert!(tight.step_rows(size) < STEP_ROWS);

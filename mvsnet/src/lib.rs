@@ -14,6 +14,7 @@ mod cpu_backend;
 mod feature_cache;
 mod input;
 mod kernels;
+mod rates;
 pub mod train;
 mod weights;
 
@@ -28,6 +29,8 @@ mod features;
 #[cfg(all(test, feature = "torch"))]
 mod golden;
 #[cfg(feature = "torch")]
+mod matrix_rate;
+#[cfg(feature = "torch")]
 mod network;
 #[cfg(feature = "torch")]
 mod refine;
@@ -40,10 +43,13 @@ mod warp;
 
 pub use analytic::AnalyticBackend;
 pub use backend::{BackendInfo, DepthBackend, InferError, InferInput};
-pub use bands::{InferCost, InferSize};
+pub use bands::{InferCost, InferSize, Operations};
 pub use cpu_backend::{CpuBackend, CpuBackendError, InferTimes};
 #[cfg(feature = "torch")]
-pub use torch_backend::{TorchBackend, TorchBackendError};
+pub use matrix_rate::matrix_rate;
+pub use rates::InferRates;
+#[cfg(feature = "torch")]
+pub use torch_backend::{PlainTimes, TorchBackend, TorchBackendError};
 pub use weights::{
     CheckpointError, CostMetric, ImportOptions, Normalization, PickleError, Refinement, WeightTensor,
     Weights, WeightsError, WeightsMetadata,

@@ -4,7 +4,7 @@ use nalgebra::Matrix3x4;
 use planesweep_scene::DepthHypotheses;
 use tch::{Device, Kind, TchError, Tensor};
 
-use crate::cost_volume::cost_volume;
+use crate::cost_volume::{cost_volume, cost_volume_at_once};
 use crate::depth;
 use crate::features::FeatureNet;
 use crate::refine::RefinementNet;
@@ -55,6 +55,7 @@ pub(crate) struct Network {
     options: (Kind, Device),
     features: FeatureNet,
     metric: CostMetric,
+    at_once: bool,
     regularization: CostRegularization,
     refinement: Option<RefinementNet>,
 }
@@ -65,9 +66,15 @@ impl Network {
             options,
             features: FeatureNet::new(weights, options)?,
             metric: weights.metadata().metric,
+            at_once: false,
             regularization: CostRegularization::new(weights, options)?,
             refinement: RefinementNet::new(weights, options)?,
         })
+    }
+
+    /// Builds cost volumes as the public implementations do, all planes at once.
+    pub(crate) fn building_at_once(self) -> Self {
+        Self { at_once: true, ..self }
     }
 
     /// An image as a tensor `[1, 3, H, W]`; both sizes are multiples of 32.
@@ -107,7 +114,8 @@ impl Network {
             let sweep = sweep.ok_or(StepError::SingularCamera)?.doing("preparing the warp")?;
             swept.push((&source.features, sweep));
         }
-        cost_volume(&reference.features, &swept, depths, self.metric).doing("building the cost volume")
+        let build = if self.at_once { cost_volume_at_once } else { cost_volume };
+        build(&reference.features, &swept, depths, self.metric).doing("building the cost volume")
     }
 
     /// The logits `[D, H, W]` of a cost volume, which is freed on the way.

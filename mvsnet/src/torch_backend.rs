@@ -1,5 +1,7 @@
 //! The network as a backend: images and cameras in, a depth map out.
 
+use std::time::{Duration, Instant};
+
 use planesweep_scene::{DepthMap, Raster, WorkingImage};
 use tch::{Cuda, Device, Kind, TchError, Tensor};
 use thiserror::Error;
@@ -38,6 +40,19 @@ pub enum TorchBackendError {
     },
 }
 
+/// Where the time of one inference on the processor went; on a GPU the work is only ordered here.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct PlainTimes {
+    /// Features of all images.
+    pub features: Duration,
+    /// Warp and variance.
+    pub cost: Duration,
+    /// The 3D network.
+    pub regularization: Duration,
+    /// Softmax, expectation, confidence and refinement.
+    pub regression: Duration,
+}
+
 /// MVSNet in libtorch.
 ///
 /// It belongs to one OS thread: libtorch keeps thread counts and memory per calling thread.
@@ -48,6 +63,7 @@ pub struct TorchBackend {
     trained_spacing_px: Option<f64>,
     device: String,
     threads: usize,
+    times: PlainTimes,
 }
 
 impl TorchBackend {
@@ -64,7 +80,20 @@ impl TorchBackend {
             trained_spacing_px: metadata.spacing_px,
             device: device.to_owned(),
             threads: threads.max(1),
+            times: PlainTimes::default(),
         })
+    }
+
+    /// The network on the processor as the public implementations run it: the features of each source are warped
+    /// onto all planes before the next one's, and channels are outermost. What ours is measured against.
+    pub fn as_published(weights: &Weights, threads: usize) -> Result<Self, TorchBackendError> {
+        let backend = Self::new(weights, "cpu", threads)?;
+        Ok(Self { network: backend.network.building_at_once(), ..backend })
+    }
+
+    /// Where the time of the last inference went.
+    pub fn times(&self) -> PlainTimes {
+        self.times
     }
 
     /// How many hypotheses make the confidence for this input: four, or more when the hypotheses are finer than
@@ -85,29 +114,41 @@ impl TorchBackend {
         pixel().and_then(|pixel| values(&pixel)).map_err(|source| self.error("reading the result", &source))
     }
 
-    fn run(&self, input: InferInput<'_>) -> Result<Inference, InferError> {
+    fn run(&mut self, input: InferInput<'_>) -> Result<Inference, InferError> {
         if input.sources.is_empty() {
             return Err(InferError::NoSources);
         }
         // Both are properties of the calling thread.
         let _guard = tch::no_grad_guard();
         tch::set_num_threads(self.threads as i32);
-        let infer = || {
+        let mut clock = Instant::now();
+        let mut lap = || {
+            let begun = std::mem::replace(&mut clock, Instant::now());
+            clock - begun
+        };
+        let mut infer = || {
             let image = self.image(input.reference)?;
             let reference = self.view(input.reference, &image)?;
             let mut sources = Vec::with_capacity(input.sources.len());
             for source in input.sources {
                 sources.push(self.view(source, &self.image(source)?)?);
             }
+            let features = lap();
             let volume = self.network.cost(&reference, &sources, &input.hypotheses.depths())?;
             drop((reference, sources));
+            let cost = lap();
             let logits = self.network.logits(volume)?;
-            self.network.regress(logits, input.hypotheses, &image, self.confidence_window(input))
+            let regularization = lap();
+            let window = self.confidence_window(input);
+            let inference = self.network.regress(logits, input.hypotheses, &image, window)?;
+            Ok((inference, PlainTimes { features, cost, regularization, regression: lap() }))
         };
-        infer().map_err(|error| match error {
+        let (inference, times) = infer().map_err(|error| match error {
             StepError::SingularCamera => InferError::SingularCamera,
             StepError::Library { doing, source } => self.error(doing, &source),
-        })
+        })?;
+        self.times = times;
+        Ok(inference)
     }
 
     fn image(&self, image: &WorkingImage) -> Result<Tensor, StepError> {
@@ -200,6 +241,19 @@ mod tests {
             metric: crate::CostMetric::Mean,
             ..WeightsMetadata::untrained(Refinement::None)
         }));
+    }
+
+    #[test]
+    fn as_published_it_gives_the_same_depths_to_rounding() {
+        let images = Images::new(96, 64, Sampling::Uniform);
+        let weights = Weights::seeded(WeightsMetadata::untrained(Refinement::Paper), 3);
+        let mut published = TorchBackend::as_published(&weights, 1).expect("the CPU is there");
+        let map = images.infer(&mut published).expect("a depth map");
+        let expected = images.infer(&mut backend(weights.metadata().clone())).expect("a depth map");
+        let differs = |(a, b): (&f32, &f32)| ((a - b) / b).abs() > 1e-4;
+        assert!(!map.depth.values().iter().zip(expected.depth.values()).any(differs));
+        let PlainTimes { features, cost, regularization, regression } = published.times();
+        assert!([features, cost, regularization, regression].iter().all(|time| !time.is_zero()));
     }
 
     #[test]

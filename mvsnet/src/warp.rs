@@ -2,7 +2,7 @@
 //! fronto-parallel planes of the reference camera.
 
 use nalgebra::{Matrix3x4, Vector3};
-use tch::{Device, TchError, Tensor};
+use tch::{Device, Kind, TchError, Tensor};
 
 /// Where samples go that have no place in the source image: beyond any border, in coordinates that run
 /// from -1 to 1 over an image of two columns or more.
@@ -65,19 +65,30 @@ impl PlaneSweep {
     /// source camera. Gives `[planes, channels, reference height, reference width]`.
     pub(crate) fn apply(&self, features: &Tensor, depths: &[f64]) -> Result<Tensor, TchError> {
         let planes = depths.len() as i64;
-        let grid = self.grid(depths)?.f_to_kind(features.kind())?;
+        let grid = self.grid(depths, Kind::Double)?.f_to_kind(features.kind())?;
         // One batch entry per plane, all of the same memory, because libtorch's threads share a batch.
         let features = features.f_expand([planes, -1, -1, -1], false)?;
         features.f_grid_sampler_2d(&grid, BILINEAR, ZEROS, true)
     }
 
-    /// Sampling positions `[planes, height, width, 2]`, f64.
-    fn grid(&self, depths: &[f64]) -> Result<Tensor, TchError> {
+    /// The same as one image of all planes below each other, with positions of the features' own precision:
+    /// what the public implementations do. Gives `[1, channels, planes, reference height, reference width]`.
+    pub(crate) fn apply_at_once(&self, features: &Tensor, depths: &[f64]) -> Result<Tensor, TchError> {
+        let grid = self.grid(depths, features.kind())?;
+        let (planes, height, width, _) = grid.size4()?;
+        let grid = grid.f_reshape([1, planes * height, width, 2])?;
+        let warped = features.f_grid_sampler_2d(&grid, BILINEAR, ZEROS, true)?;
+        warped.f_view([1, -1, planes, height, width])
+    }
+
+    /// Sampling positions `[planes, height, width, 2]`, computed in this precision.
+    fn grid(&self, depths: &[f64], kind: Kind) -> Result<Tensor, TchError> {
         let offsets: Vec<f64> = depths.iter().flat_map(|depth| (self.offset / *depth).data.0[0]).collect();
         let offsets = Tensor::f_from_slice(&offsets)?
             .f_view([depths.len() as i64, 3, 1, 1])?
+            .f_to_kind(kind)?
             .f_to_device(self.base.device())?;
-        let position = self.base.f_add(&offsets)?;
+        let position = self.base.f_to_kind(kind)?.f_add(&offsets)?;
         let depth = position.f_narrow(1, 2, 1)?;
         position
             .f_narrow(1, 0, 2)?
@@ -92,7 +103,6 @@ impl PlaneSweep {
 mod tests {
     use nalgebra::{Matrix3, Point2, Point3};
     use planesweep_scene::{Camera, Intrinsics, Pose};
-    use tch::Kind;
 
     use super::*;
 
@@ -128,7 +138,7 @@ mod tests {
             * inverse;
         let expected = homography * pixel.to_homogeneous();
 
-        let grid = sweep(&source).grid(&[1.0, depth]).expect("a grid");
+        let grid = sweep(&source).grid(&[1.0, depth], Kind::Double).expect("a grid");
         let x = (grid.double_value(&[1, 6, 4, 0]) + 1.0) * 11.0 / 2.0;
         let y = (grid.double_value(&[1, 6, 4, 1]) + 1.0) * 8.0 / 2.0;
         assert!((x - expected.x / expected.z).abs() < 1e-12 && (y - expected.y / expected.z).abs() < 1e-12);
@@ -142,6 +152,17 @@ mod tests {
         let warped = sweep(&reference()).apply(&features, &[1.0, 9.0]).expect("features");
         assert_eq!(warped.size(), [2, 2, 9, 12]);
         assert!((warped - features).abs().max().double_value(&[]) < 1e-5);
+    }
+
+    #[test]
+    fn all_planes_at_once_are_the_same() {
+        let source = camera(Point3::new(1.0, 0.5, -0.5), Point3::new(0.0, 0.0, 4.0));
+        let features = Tensor::rand([1, 2, 9, 12], (Kind::Double, Device::Cpu));
+        let depths = [1.0, 3.7, 50.0];
+        let by_planes = sweep(&source).apply(&features, &depths).expect("features");
+        let at_once = sweep(&source).apply_at_once(&features, &depths).expect("features");
+        assert_eq!(at_once.size(), [1, 2, 3, 9, 12]);
+        assert!((at_once.squeeze_dim(0).transpose(0, 1) - by_planes).abs().max().double_value(&[]) < 1e-12);
     }
 
     #[test]

@@ -37,6 +37,12 @@ pub(crate) fn features_bytes(width: usize, height: usize) -> usize {
     slab(1, 3) + 2 * (slab(1, 8) + slab(2, 16) + slab(4, 32))
 }
 
+/// Bytes of the slabs that [`refined`] takes for a depth map of this size.
+pub(super) fn refined_bytes(width: usize, rows: usize) -> usize {
+    let slab = |channels| Shape { columns: rows, channels, length: width }.bytes();
+    slab(4) + 2 * slab(32) + slab(8)
+}
+
 fn to_slab(pool: &Arc<Pool>, image: &InputImage) -> Slab {
     let InputImage { width, height, planes } = image;
     let mut slab = pool.take(Shape { columns: *height, channels: 3, length: *width });

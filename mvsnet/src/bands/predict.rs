@@ -15,29 +15,93 @@ pub struct InferSize {
     pub depths: usize,
     /// Views, the reference included.
     pub views: usize,
+    /// Whether the weights have a refinement network.
+    pub refined: bool,
 }
 
-/// What it will cost.
+/// Floating-point operations of each part, as the plain network counts them: a multiplication and an addition are
+/// two.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Operations {
+    /// Features of all views.
+    pub features: f64,
+    /// Warp and variance.
+    pub warp: f64,
+    /// The first layer of the 3D network.
+    pub first_layer: f64,
+    /// The 3D network without its first and its last layer.
+    pub middle_layers: f64,
+    /// The last layer of the 3D network.
+    pub last_layer: f64,
+    /// Refinement.
+    pub refinement: f64,
+}
+
+/// What an inference will cost.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct InferCost {
     /// The most memory that `CpuBackend` holds besides its input and the features of other images.
     pub bytes: u64,
-    /// Floating-point operations, features of all views included, as the plain network counts them.
-    pub operations: f64,
+    /// Its arithmetic.
+    pub operations: Operations,
 }
 
 /// Weights, their packed forms, the threads' stacks and buffers too small to count: measured.
-const FIXED_BYTES: usize = 8 << 20;
+const FIXED_BYTES: usize = 3 << 20;
 /// Transformed values and the ring of cost columns of one thread, for each depth.
 const THREAD_BYTES_PER_DEPTH: usize = 7 * 32 * 4 + 8 * 36 + 16 * 4;
 /// The same, whatever the depths.
 const THREAD_BYTES: usize = 512 << 10;
-/// Operations of the features, for each pixel of an image.
-const FEATURE_OPERATIONS: f64 = 9248.0;
-/// Operations of warp and variance, for each voxel and source: bilinear weights, sums, squares in 32 channels.
+/// Index and confidence of a pixel of the depth map, as they come and as they are handed on.
+const PIXEL_BYTES: usize = 40;
+/// Indices of a pixel on their way through refinement, and the image that guides them.
+const REFINED_PIXEL_BYTES: usize = 3 * 8 + 3 * 4;
+
+/// Operations of the features, for each pixel of an image: 3x3 layers 3-8 and 8-8; at half size a 5x5 layer 8-16 and
+/// two of 16-16; at a quarter a 5x5 layer 16-32 and two of 32-32.
+const FEATURE_OPERATIONS: f64 =
+    432.0 + 1152.0 + (6400.0 + 2.0 * 4608.0) / 4.0 + (25600.0 + 2.0 * 18432.0) / 16.0;
+/// Of warp and variance, for each voxel and source: bilinear weights, sums, squares in 32 channels.
 const WARP_OPERATIONS: f64 = 32.0 * 11.0;
-/// Operations of the 3D network, for each voxel.
-const VOLUME_OPERATIONS: f64 = 20_304.0;
+/// Of the 3D network's first layer, 32-8, for each voxel.
+const FIRST_LAYER_OPERATIONS: f64 = 13824.0;
+/// Of its other layers but the last, for each voxel: 8-16, 16-16, 16-8 at an eighth of the volume, and so on.
+const MIDDLE_LAYER_OPERATIONS: f64 = (6912.0 + 13824.0 + 6912.0) / 8.0
+    + (27648.0 + 55296.0 + 27648.0) / 64.0
+    + (110592.0 + 221184.0 + 110592.0) / 512.0;
+/// Of its last layer, 8-1, for each voxel.
+const LAST_LAYER_OPERATIONS: f64 = 432.0;
+/// Of the refinement, for each pixel of the depth map: 4-32, twice 32-32, 32-1.
+const REFINEMENT_OPERATIONS: f64 = 2304.0 + 2.0 * 18432.0 + 576.0;
+
+impl InferSize {
+    /// The arithmetic of an inference on images padded to what the network takes.
+    pub fn operations(self) -> Operations {
+        let (width, height) = self.padded();
+        let pixels = (width * height) as f64;
+        let voxels = pixels / 16.0 * self.depths as f64;
+        Operations {
+            features: FEATURE_OPERATIONS * pixels * self.views as f64,
+            warp: WARP_OPERATIONS * voxels * (self.views as f64 - 1.0),
+            first_layer: FIRST_LAYER_OPERATIONS * voxels,
+            middle_layers: MIDDLE_LAYER_OPERATIONS * voxels,
+            last_layer: LAST_LAYER_OPERATIONS * voxels,
+            refinement: if self.refined { REFINEMENT_OPERATIONS * pixels / 16.0 } else { 0.0 },
+        }
+    }
+
+    fn padded(self) -> (usize, usize) {
+        (self.width.next_multiple_of(SIZE_MULTIPLE), self.height.next_multiple_of(SIZE_MULTIPLE))
+    }
+}
+
+impl Operations {
+    /// Of the whole inference.
+    pub fn total(&self) -> f64 {
+        let Self { features, warp, first_layer, middle_layers, last_layer, refinement } = self;
+        features + warp + first_layer + middle_layers + last_layer + refinement
+    }
+}
 
 /// Rows of the volume that are taken at a time where the memory allows it.
 pub(crate) const STEP_ROWS: usize = 8;
@@ -58,19 +122,22 @@ pub(crate) fn step_rows(size: InferSize, threads: usize, memory_bytes: Option<u6
 /// The cost of an inference with all its rows, `step_rows` rows of the volume at a time.
 pub(crate) fn predict(size: InferSize, threads: usize, step_rows: usize) -> InferCost {
     let InferSize { depths, views, .. } = size;
-    let (width, height) =
-        (size.width.next_multiple_of(SIZE_MULTIPLE), size.height.next_multiple_of(SIZE_MULTIPLE));
+    let (width, height) = size.padded();
     let pixels = width * height;
+    let map_pixels = pixels / 16;
     let maps = views * (width / 4 + 2) * (height / 4 + 2) * 32 * 4;
-    let images = images::features_bytes(width, height) + 3 * pixels * 4;
-    let volume = volume_bytes(width / 4, height / 4, depths, step_rows);
-    let pixel_bytes = pixels / 16 * 40;
+    let input = 3 * pixels * 4;
+    let features = images::features_bytes(width, height) + input;
+    let volume = volume_bytes(width / 4, height / 4, depths, step_rows) + map_pixels * PIXEL_BYTES;
+    let refinement = if size.refined {
+        let indices = map_pixels * (PIXEL_BYTES + REFINED_PIXEL_BYTES);
+        indices + input.max(images::refined_bytes(width / 4, height / 4))
+    } else {
+        0
+    };
     let threads = threads * (THREAD_BYTES + THREAD_BYTES_PER_DEPTH * depths);
-    let bytes = FIXED_BYTES + threads + maps + images.max(volume + pixel_bytes);
-    let voxels = (pixels / 16 * depths) as f64;
-    let operations = FEATURE_OPERATIONS * (pixels * views) as f64
-        + voxels * (VOLUME_OPERATIONS + WARP_OPERATIONS * (views as f64 - 1.0));
-    InferCost { bytes: bytes as u64, operations }
+    let bytes = FIXED_BYTES + threads + maps + features.max(volume).max(refinement);
+    InferCost { bytes: bytes as u64, operations: size.operations() }
 }
 
 /// Bytes of the slabs that the 3D network takes from its pool.
@@ -126,6 +193,17 @@ mod tests {
     use crate::kernels::simd::Level;
     use crate::kernels::slab::Pool;
     use crate::{CostMetric, Refinement, Weights, WeightsMetadata};
+
+    #[test]
+    fn operations_are_those_of_the_layers() {
+        let size = InferSize { width: 1152, height: 864, depths: 192, views: 5, refined: false };
+        let Operations { features, warp, first_layer, middle_layers, last_layer, .. } = size.operations();
+        // As counted for the public port, in units of 1e9.
+        assert!((features / 1e9 - 46.7).abs() < 0.1 && (warp / 1e9 - 18.1).abs() < 1.5);
+        assert!(((first_layer + middle_layers + last_layer) / 1e9 - 242.5).abs() < 0.1);
+        let refined = InferSize { refined: true, ..size }.operations();
+        assert!(refined.total() > size.operations().total());
+    }
 
     #[test]
     fn predicted_slabs_are_those_that_are_taken() {

@@ -6,6 +6,10 @@ use std::path::PathBuf;
 
 use nalgebra::Matrix3x4;
 use planesweep_scene::{DepthHypotheses, Sampling};
+use proptest::prelude::any;
+use proptest::sample::select;
+use proptest::strategy::{Strategy, ValueTree};
+use proptest::test_runner::TestRunner;
 use tch::{Device, IndexOp, Kind, Tensor};
 
 use super::*;
@@ -124,6 +128,40 @@ fn compare(refinement: Refinement, metric: CostMetric, sampling: Sampling, level
         &all_plain,
         &truth,
     );
+}
+
+/// Random sizes, numbers of depths and of views, step heights, weights and refinements; the errors of the pixels of a
+/// few cases are judged together, since those of one small image say little about extremes.
+#[test]
+fn as_exact_for_any_sizes_and_weights() {
+    let case = (
+        (20_usize..110, 20_usize..110, 2_u32..34),
+        (2_usize..6, 1_usize..12, any::<u64>()),
+        select(vec![Refinement::None, Refinement::Paper, Refinement::WithBnRelu]),
+        select(vec![Sampling::Uniform, Sampling::Inverse]),
+        select(Level::available()),
+    );
+    let mut runner = TestRunner::deterministic();
+    for batch in 0..2 {
+        let (mut all_ours, mut all_plain, mut truth) = <(Said, Said, Said)>::default();
+        for _ in 0..6 {
+            let ((width, height, depths), (views, step_rows, seed), refinement, sampling, level) =
+                case.new_tree(&mut runner).expect("a case").current();
+            let weights = Weights::seeded(WeightsMetadata::untrained(refinement), seed);
+            let mut images = Images::new(width, height, sampling);
+            for view in images.sources.len()..views - 1 {
+                let mut source = images.sources[view % 2].clone();
+                source.camera.pose.translation.x += 0.07 * view as f64;
+                images.sources.push(source);
+            }
+            images.sources.truncate(views - 1);
+            images.hypotheses = DepthHypotheses::new(sampling, 2.0, 8.0, depths).expect("a valid range");
+            all_ours.append(ours(&weights, &images, level, step_rows));
+            all_plain.append(plain(&weights, Kind::Float, &images));
+            truth.append(plain(&weights, Kind::Double, &images));
+        }
+        assert_as_exact(&format!("batch {batch}"), &all_ours, &all_plain, &truth);
+    }
 }
 
 #[test]
