@@ -7,10 +7,7 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use nalgebra::Point3;
-use planesweep_tests::{
-    Bounds, Finished, confident_share, convert_middlebury, convert_rgbd, reference_weights, run, shared_data,
-};
+use planesweep_tests::{Finished, confident_share, reference_weights, run, shared_scenes};
 use serde_json::Value;
 
 const NAME: &str = "all_scenes";
@@ -31,7 +28,7 @@ fn main() -> ExitCode {
         "{:20} {:>5} {:>7} {:>8} {:>7} {:>9} {:>9} {:>6} {:>6}",
         "scene", "views", "seconds", "points", "skipped", "conf>0.8", "median", "1 %", "5 %"
     );
-    for (name, scene) in scenes(&out) {
+    for (name, scene) in shared_scenes(NAME, &out) {
         let result = out.join(name);
         let arguments = ["reconstruct", text(&scene), "-o", text(&result), "--weights", text(&weights)];
         let reconstructed = run(arguments.into_iter().chain(["--json", "--max-size", &max_size]));
@@ -42,39 +39,6 @@ fn main() -> ExitCode {
     }
     ExitCode::SUCCESS
 }
-
-/// The scenes by name; those in formats that are not read are converted first.
-fn scenes(out: &Path) -> Vec<(&'static str, PathBuf)> {
-    let read_as_they_are = [
-        ("hololens_b", "scenes/hololens_b"),
-        ("hololens_c", "scenes/hololens_c"),
-        ("dtu_scan37_10v", "scenes/dtu_scan37_10v"),
-        ("bartoszek", "colmap/bartoszek/dense/0"),
-        ("sceaux", "colmap/sceaux"),
-        ("meeting_room_40", "scenes/meeting_room_40"),
-    ];
-    let mut scenes = Vec::new();
-    if let Some(source) = shared_data(NAME, "scenes/open3d_rgbd") {
-        let scene = out.join("scenes/open3d_rgbd");
-        convert_rgbd(&source.join("RGBD"), &source.join("camera_primesense.json"), &scene);
-        scenes.push(("open3d_rgbd", scene));
-    }
-    if let Some(source) = shared_data(NAME, "scenes/templeSparseRing") {
-        let scene = out.join("scenes/templeSparseRing");
-        convert_middlebury(&source, "templeSR_par.txt", TEMPLE, &scene);
-        scenes.push(("templeSparseRing", scene));
-    }
-    let there =
-        read_as_they_are.into_iter().filter_map(|(name, path)| Some((name, shared_data(NAME, path)?)));
-    scenes.extend(there);
-    scenes
-}
-
-/// From the README of the data set.
-const TEMPLE: Bounds = Bounds {
-    min: Point3::new(-0.073568, 0.021728, -0.012445),
-    max: Point3::new(0.028855, 0.181892, 0.062736),
-};
 
 fn row(name: &str, out: &Path, run: &Finished, measured: Option<&Finished>) -> String {
     let value: Value = serde_json::from_str(&run.stdout).unwrap_or_default();

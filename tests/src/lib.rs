@@ -13,6 +13,7 @@ mod faults;
 mod program;
 mod results;
 mod scenes;
+mod shared_scenes;
 
 pub use bench::Bench;
 pub use convert_middlebury::{Bounds, convert_middlebury};
@@ -21,4 +22,5 @@ pub use data::{reference_weights, shared_data};
 pub use faults::{children, is_alive, send, wait_until};
 pub use program::{Finished, Running, run};
 pub use results::{blobs, confident_share, files_below};
-pub use scenes::{courtyard, plane, plane_of_size, seeded_weights};
+pub use scenes::{courtyard, plane, plane_of_size, seeded_weights, seeded_weights_with};
+pub use shared_scenes::shared_scenes;
