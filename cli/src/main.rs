@@ -6,6 +6,7 @@
 mod args;
 mod commands;
 mod console;
+mod forecast;
 mod input;
 mod network;
 mod out_folder;
@@ -33,6 +34,8 @@ fn main() -> ExitCode {
         Command::Train(args) => commands::train::run(&args),
         Command::Weights(args) => commands::weights::run(&args),
         Command::Evaluate(args) => commands::evaluate::run(&args),
+        Command::Bench(args) => commands::bench::run(&args),
+        Command::BenchSide(args) => commands::bench::side::run(&args),
         Command::Worker(args) => commands::worker::run(args),
     };
     match done {

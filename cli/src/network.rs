@@ -66,18 +66,19 @@ pub fn backend_factory(placement: &Placement) -> Result<BackendFactory> {
 }
 
 /// What a worker needs beside its inference: images, depth maps, the program itself.
-const WORKER_BYTES: u64 = 400 << 20;
+pub const WORKER_BYTES: u64 = 400 << 20;
 /// The plain network's peak, in bytes per voxel of the padded volume: the cost volume of 32 floats
 /// and what is alive beside it.
 const PLAIN_BYTES_PER_VOXEL: u64 = 32 * 4 * 2;
 
 /// Sizes of the inference of a view.
-pub fn infer_size(view: &ViewPlan) -> InferSize {
+pub fn infer_size(view: &ViewPlan, refined: bool) -> InferSize {
     InferSize {
         width: view.working_size.0 as usize,
         height: view.working_size.1 as usize,
         depths: view.hypotheses.count() as usize,
         views: view.sources.len() + 1,
+        refined,
     }
 }
 
@@ -85,9 +86,9 @@ pub fn infer_size(view: &ViewPlan) -> InferSize {
 const THREADS_PER_WORKER: usize = 8;
 
 /// As many workers as make the machine busy, while the memory that is available holds them.
-pub fn default_workers(plan: &Plan, device: &str) -> u32 {
+pub fn default_workers(plan: &Plan, device: &str, refined: bool) -> u32 {
     let inference_bytes = |view: &ViewPlan| {
-        let size = infer_size(view);
+        let size = infer_size(view, refined);
         if device == "cpu" {
             InferCost::predict(size, 1, None).bytes
         } else {

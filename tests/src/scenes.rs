@@ -52,8 +52,13 @@ pub fn plane_of_size(folder: &Path, views: u32, width: u32, height: u32) -> Scen
 
 /// Writes untrained weights and returns their path.
 pub fn seeded_weights(folder: &Path) -> PathBuf {
+    seeded_weights_with(folder, Refinement::None)
+}
+
+/// The same for a network with this refinement.
+pub fn seeded_weights_with(folder: &Path, refinement: Refinement) -> PathBuf {
     let path = folder.join("seeded.safetensors");
-    let weights = Weights::seeded(WeightsMetadata::untrained(Refinement::None), 7);
+    let weights = Weights::seeded(WeightsMetadata::untrained(refinement), 7);
     fs::write(&path, weights.to_bytes()).expect("written");
     path
 }

@@ -10,6 +10,8 @@ use clap::{Parser, Subcommand};
 pub use self::fusion::FilterArgs;
 pub use self::inference::{NetworkArgs, PlanArgs};
 pub use self::scene::ReadArgs;
+use crate::commands::bench::BenchArgs;
+use crate::commands::bench::side::SideArgs;
 use crate::commands::depth::DepthArgs;
 use crate::commands::evaluate::EvaluateCommand;
 use crate::commands::inspect::InspectArgs;
@@ -58,6 +60,11 @@ pub enum Command {
     /// Measure how good a result is.
     #[command(subcommand)]
     Evaluate(EvaluateCommand),
+    /// Measure how fast the network is on this machine, ours against libtorch.
+    Bench(BenchArgs),
+    /// One side of a bench; answers requests on standard input.
+    #[command(hide = true)]
+    BenchSide(SideArgs),
     /// Work for a coordinator until it says stop.
     Worker(WorkerArgs),
 }

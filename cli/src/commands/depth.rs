@@ -113,7 +113,8 @@ fn infer(args: &DepthArgs, weights: &Weights, input: InferInput<'_>) -> Result<(
     Ok((map, probability.context("cannot probe")?))
 }
 
-fn find<'a>(scene: &Scene, plan: &'a Plan, wanted: &str) -> Result<&'a ViewPlan> {
+/// The plan of a view, by name or id.
+pub(super) fn find<'a>(scene: &Scene, plan: &'a Plan, wanted: &str) -> Result<&'a ViewPlan> {
     let known = scene.views.values().find(|view| view.name == wanted || view.id.to_string() == wanted);
     let Some(known) = known else {
         let names: Vec<&str> = scene.views.values().take(10).map(|view| view.name.as_str()).collect();

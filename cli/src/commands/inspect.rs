@@ -4,15 +4,17 @@ use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::Args;
-use planesweep_mvsnet::InferCost;
+use planesweep_mvsnet::{InferRates, Refinement};
 use planesweep_plan::{Plan, RangeOrigin, ViewPlan, plan};
 use planesweep_scene::{Sampling, Scene};
 use serde_json::json;
 
+use crate::args::values::bytes;
 use crate::args::{FilterArgs, PlanArgs, ReadArgs};
 use crate::console::{Outcome, table};
+use crate::forecast::{Forecast, Team, ViewForecast};
 use crate::input::{self, all_skipped};
-use crate::network::infer_size;
+use crate::network::{default_workers, processors, read_weights};
 
 /// Arguments of `inspect`.
 #[derive(Debug, Args)]
@@ -20,6 +22,18 @@ use crate::network::infer_size;
 pub struct InspectArgs {
     /// The scene.
     pub scene: PathBuf,
+    /// The weights that will be used; they decide whether depth maps are refined, which takes time.
+    #[arg(long, env = "PLANESWEEP_WEIGHTS", value_name = "FILE")]
+    pub weights: Option<PathBuf>,
+    /// Worker processes, as for `reconstruct`.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub workers: Option<u32>,
+    /// Threads of each worker's inference, as for `reconstruct`.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
+    /// Memory for inference, as for `reconstruct`.
+    #[arg(long, value_name = "SIZE", value_parser = bytes)]
+    pub memory: Option<u64>,
     #[command(flatten)]
     pub plan: PlanArgs,
     #[command(flatten)]
@@ -46,8 +60,17 @@ pub fn run(args: &InspectArgs) -> Result<Outcome> {
     for view in &skipped {
         text.push_str(&format!("skipped: {}: {}\n", view.view, view.reason));
     }
+    let team = team(args, &plan)?;
+    let forecast = Forecast::new(&plan, team, &InferRates::measure(team.threads)?);
     text.push('\n');
-    text.push_str(&table(&rows(scene, &plan)));
+    text.push_str(&table(&rows(scene, &plan, &forecast)));
+    text.push_str(&format!(
+        "\non the processors of this machine: {:.0} s for the depth maps with {} workers of {} threads, {} MiB each\n",
+        forecast.seconds,
+        team.workers,
+        team.threads,
+        forecast.worker_bytes >> 20,
+    ));
     let value = json!({
         "scene": args.scene,
         "views": scene.views.len(),
@@ -55,11 +78,22 @@ pub fn run(args: &InspectArgs) -> Result<Outcome> {
         "warnings": scene.warnings,
         "skipped": skipped,
         "plan": plan,
+        "forecast": forecast,
     });
     Ok(Outcome { text, value, skipped_views: !skipped.is_empty() })
 }
 
-fn rows(scene: &Scene, plan: &Plan) -> Vec<Vec<String>> {
+/// The workers that `reconstruct` would start.
+fn team(args: &InspectArgs, plan: &Plan) -> Result<Team> {
+    let weights = args.weights.as_deref().map(read_weights).transpose()?;
+    let refined = weights.is_some_and(|(_, weights)| weights.metadata().refinement != Refinement::None);
+    let workers = args.workers.unwrap_or_else(|| default_workers(plan, "cpu", refined));
+    let threads = args.threads.map_or((processors() / workers as usize).max(1), |threads| threads as usize);
+    let memory_bytes = args.memory.map(|bytes| bytes / u64::from(workers));
+    Ok(Team { workers, threads, memory_bytes, refined })
+}
+
+fn rows(scene: &Scene, plan: &Plan, forecast: &Forecast) -> Vec<Vec<String>> {
     let heading = [
         "view",
         "image",
@@ -70,22 +104,21 @@ fn rows(scene: &Scene, plan: &Plan) -> Vec<Vec<String>> {
         "planes",
         "memory",
         "GFLOP",
+        "seconds",
         "neighbours",
         "sources",
     ];
     let mut rows = vec![heading.map(str::to_owned).to_vec()];
-    let mut views: Vec<&ViewPlan> = plan.views.iter().collect();
-    views.sort_by_key(|view| view.view);
-    rows.extend(views.into_iter().map(|view| row(scene, view)));
+    let mut views: Vec<(&ViewPlan, &ViewForecast)> = plan.views.iter().zip(&forecast.views).collect();
+    views.sort_by_key(|(view, _)| view.view);
+    rows.extend(views.into_iter().map(|(view, forecast)| row(scene, view, forecast)));
     rows
 }
 
-fn row(scene: &Scene, plan: &ViewPlan) -> Vec<String> {
+fn row(scene: &Scene, plan: &ViewPlan, forecast: &ViewForecast) -> Vec<String> {
     let view = &scene.views[&plan.view];
     let size = &view.camera.intrinsics;
     let planes = &plan.hypotheses;
-    // On the processor, with one thread.
-    let cost = InferCost::predict(infer_size(plan), 1, None);
     let sources: Vec<&str> = plan.sources.iter().map(|id| scene.views[id].name.as_str()).collect();
     vec![
         view.name.clone(),
@@ -107,8 +140,9 @@ fn row(scene: &Scene, plan: &ViewPlan) -> Vec<String> {
             planes.count(),
             if planes.sampling() == Sampling::Uniform { "uniform" } else { "inverse" }
         ),
-        format!("{} MiB", cost.bytes >> 20),
-        format!("{:.0}", cost.operations / 1e9),
+        format!("{} MiB", forecast.bytes >> 20),
+        format!("{:.0}", forecast.operations / 1e9),
+        format!("{:.2}", forecast.seconds),
         plan.neighbours.len().to_string(),
         sources.join(" "),
     ]

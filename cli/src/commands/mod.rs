@@ -1,5 +1,6 @@
 //! One file per command.
 
+pub mod bench;
 pub mod depth;
 pub mod evaluate;
 mod export;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
 use planesweep_coordinator::{Config, Coordinator, Handle};
-use planesweep_mvsnet::Weights;
+use planesweep_mvsnet::{Refinement, Weights};
 use planesweep_plan::{BlobKey, Job, JobId, Plan, RunId, jobs, plan};
 use planesweep_proto::{JobResult, JobState, RunStatus, SubmitHeader};
 use planesweep_worker::Store;
@@ -97,7 +97,8 @@ pub fn run(args: &ReconstructArgs, json: bool, verbose: u8) -> Result<Outcome> {
     }
     let weights_key = BlobKey::of(&weights_bytes);
     let jobs = jobs(&input.scene, &plan, &input.image_hashes, weights_key)?;
-    let workers = args.workers.unwrap_or_else(|| default_workers(&plan, &placement.device));
+    let refined = weights.metadata().refinement != Refinement::None;
+    let workers = args.workers.unwrap_or_else(|| default_workers(&plan, &placement.device, refined));
     let placement = Placement {
         threads: args.threads.map_or((processors() / workers as usize).max(1), |threads| threads as usize),
         memory_bytes: args.network.memory.map(|bytes| bytes / u64::from(workers)),
