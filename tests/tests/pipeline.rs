@@ -24,7 +24,9 @@ fn the_plane_comes_out_exact_and_the_folder_is_complete() {
     let bench = of_plane();
     // The default tolerance would let samples at the border of a map in, which mix with the nothing
     // beside it; this one is 1e-4 in depth.
-    let exact = ["--device", "analytic", "--min-views", "3", "--max-depth-difference", "0.00002"];
+    // Every view emits what it sees, so that the points can be counted.
+    let exact =
+        ["--device", "analytic", "--min-views", "3", "--max-depth-difference", "0.00002", "--every-view"];
     let value = bench.reconstruct("out", &exact).expect_code(0).json();
     let out = bench.path("out");
 
@@ -63,7 +65,7 @@ fn the_number_of_workers_changes_no_bit() {
     let bench = of_courtyard();
     let one = bench.reconstruct("one", &["--workers", "1"]).expect_code(0).json();
     let two = bench.reconstruct("two", &["--workers", "2"]).expect_code(0).json();
-    assert!(one["points"].as_u64() > Some(1000), "{}", one["points"]);
+    assert!(one["points"].as_u64() > Some(500), "{}", one["points"]);
     assert_eq!(one["cloud_blake3"], two["cloud_blake3"]);
     assert!(bench.read("one/cloud.ply") == bench.read("two/cloud.ply"));
     for name in ["run.json", "pair.txt", "depth/00000000.pfm", "confidence/00000003.pfm"] {
@@ -80,7 +82,7 @@ fn bands_of_rows_change_no_bit() {
     let whole = bench.reconstruct("whole", &size).expect_code(0).json();
     let options = [&size[..], &["--band-rows", "512", "--workers", "2"]].concat();
     let banded = bench.reconstruct("banded", &options).expect_code(0).json();
-    assert!(whole["points"].as_u64() > Some(1000), "{}", whole["points"]);
+    assert!(whole["points"].as_u64() > Some(500), "{}", whole["points"]);
     assert!(bench.read("whole/cloud.ply") == bench.read("banded/cloud.ply"));
     for name in ["depth/00000000.pfm", "confidence/00000002.pfm", "cams/00000001_cam.txt"] {
         let read = |out: &str| bench.read(&format!("{out}/{name}"));
