@@ -32,6 +32,7 @@ fn main() -> ExitCode {
         Command::Depth(args) => commands::depth::run(&args),
         Command::Synth(args) => commands::synth::run(&args),
         Command::Train(args) => commands::train::run(&args),
+        Command::RenderDepth(args) => commands::render_depth::run(&args),
         Command::Weights(args) => commands::weights::run(&args),
         Command::Evaluate(args) => commands::evaluate::run(&args),
         Command::Bench(args) => commands::bench::run(&args),

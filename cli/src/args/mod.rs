@@ -16,6 +16,7 @@ use crate::commands::depth::DepthArgs;
 use crate::commands::evaluate::EvaluateCommand;
 use crate::commands::inspect::InspectArgs;
 use crate::commands::reconstruct::ReconstructArgs;
+use crate::commands::render_depth::RenderDepthArgs;
 use crate::commands::synth::SynthArgs;
 use crate::commands::train::TrainArgs;
 use crate::commands::weights::WeightsCommand;
@@ -50,10 +51,12 @@ pub enum Command {
     Inspect(InspectArgs),
     /// Infer the depth map of one view in this process.
     Depth(DepthArgs),
-    /// Make a scene with exact ground truth.
+    /// Make a scene with exact ground truth, or training samples.
     Synth(SynthArgs),
     /// Train weights from scratch on generated scenes; the same command again resumes.
     Train(TrainArgs),
+    /// Render depth maps of a triangle mesh, as training data.
+    RenderDepth(RenderDepthArgs),
     /// Import or inspect weights of the network.
     #[command(subcommand)]
     Weights(WeightsCommand),

@@ -6,6 +6,7 @@ pub mod evaluate;
 mod export;
 pub mod inspect;
 pub mod reconstruct;
+pub mod render_depth;
 pub mod synth;
 pub mod train;
 pub mod weights;
