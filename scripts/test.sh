@@ -5,8 +5,11 @@
 set -uo pipefail
 cd "$(dirname "$0")/.."
 
-# The program itself is what several suites start.
-cargo build -p planesweep || exit 1
+# Everything at once: packages built one by one would build their dependencies again, with other features.
+cargo build --workspace --all-targets || exit 1
+# What several suites start.
+PLANESWEEP_PROGRAM="${CARGO_TARGET_DIR:-$PWD/target}/debug/planesweep"
+export PLANESWEEP_PROGRAM
 if command -v cargo-nextest >/dev/null; then
     # nextest runs no documentation tests.
     cargo test --workspace --doc --quiet || exit 1
