@@ -28,9 +28,8 @@ pub fn unit(hash: u32) -> f32 {
 /// Gradient noise of unit wavelength, about `[-1, 1]`, zero at lattice points.
 #[inline]
 pub fn gradient_noise([x, y, z]: [f32; 3], seed: u32) -> f32 {
-    let floor = [x.floor(), y.floor(), z.floor()];
-    let [ix, iy, iz] = floor.map(|v| v as i32);
-    let [fx, fy, fz] = [x - floor[0], y - floor[1], z - floor[2]];
+    let [ix, iy, iz] = [x, y, z].map(floor);
+    let [fx, fy, fz] = [x - ix as f32, y - iy as f32, z - iz as f32];
     let [u, v, w] = [fx, fy, fz].map(fade);
     let corner = |dx: i32, dy: i32, dz: i32| {
         let h = hash(ix + dx, iy + dy, iz + dz, seed);
@@ -74,7 +73,7 @@ pub struct Cell {
 /// middles.
 #[inline]
 pub fn cells(x: f32, y: f32, scatter: f32, seed: u32) -> Cell {
-    let (ix, iy) = (x.floor() as i32, y.floor() as i32);
+    let (ix, iy) = (floor(x), floor(y));
     let mut cell = Cell { nearest: f32::INFINITY, second: f32::INFINITY, id: 0 };
     for cy in iy - 1..=iy + 1 {
         for cx in ix - 1..=ix + 1 {
@@ -103,6 +102,14 @@ pub fn lerp(a: f32, b: f32, t: f32) -> f32 {
 pub fn smoothstep(low: f32, high: f32, x: f32) -> f32 {
     let t = ((x - low) / (high - low)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
+}
+
+/// The next integer below. Without the instruction for it, as on the plainest of processors that are
+/// compiled for, the library's own is a call.
+#[inline]
+fn floor(x: f32) -> i32 {
+    let towards_zero = x as i32;
+    towards_zero - i32::from((towards_zero as f32) > x)
 }
 
 #[inline]

@@ -75,11 +75,12 @@ impl Bounds {
     pub fn crossing(&self, origin: &Point3<f64>, inverse: &Vector3<f64>, span: Span) -> Option<Span> {
         let Span { mut min, mut max } = span;
         for axis in 0..3 {
-            let a = (self.min[axis] - origin[axis]) * inverse[axis];
-            let b = (self.max[axis] - origin[axis]) * inverse[axis];
-            // Zero times infinity gives NaN, which min and max skip: the ray lies in that face.
-            min = min.max(a.min(b));
-            max = max.min(a.max(b));
+            let (first, last) = if inverse[axis] < 0.0 { (self.max, self.min) } else { (self.min, self.max) };
+            let near = (first[axis] - origin[axis]) * inverse[axis];
+            let far = (last[axis] - origin[axis]) * inverse[axis];
+            // Zero times infinity gives NaN, which both comparisons skip: the ray lies in that face.
+            min = if near > min { near } else { min };
+            max = if far < max { far } else { max };
         }
         (min <= max).then_some(Span { min, max })
     }

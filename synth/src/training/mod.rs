@@ -143,7 +143,7 @@ impl Draft {
 /// The share of pixels of a view, at a quarter of its size, whose light differs from a neighbour's.
 fn texture(stage: &Stage, camera: &Camera) -> f64 {
     let map = Camera { intrinsics: camera.intrinsics.quartered(), pose: camera.pose };
-    let light = shoot::light(stage, &map);
+    let light = shoot::rough_light(stage, &map);
     let differ = |a: [f32; 3], b: [f32; 3]| (a[1] - b[1]).abs() > DIFFERENCE * a[1].max(b[1]);
     let pixels = (1..light.height()).flat_map(|y| (1..light.width()).map(move |x| (x, y)));
     let count = pixels
