@@ -29,6 +29,7 @@ fn main() -> ExitCode {
     let done = match cli.command {
         Command::Reconstruct(args) => commands::reconstruct::run(&args, json, cli.verbose),
         Command::Inspect(args) => commands::inspect::run(&args),
+        Command::Convert(args) => commands::convert::run(&args),
         Command::Depth(args) => commands::depth::run(&args),
         Command::Synth(args) => commands::synth::run(&args),
         Command::Train(args) => commands::train::run(&args),

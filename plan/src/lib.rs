@@ -9,7 +9,9 @@
 #![warn(missing_docs)]
 
 mod bands;
+mod checkup;
 mod depth_range;
+mod focus;
 mod ids;
 mod job;
 mod jobs;
@@ -19,6 +21,7 @@ mod plan;
 mod size;
 mod views;
 
+pub use checkup::{Finding, Severity, checkup, sparse_depths};
 pub use depth_range::{DEPTH_MULTIPLE, MIN_POINTS};
 pub use ids::{Attempt, BlobKey, JobId, ParseHashError, RunId, WorkerId};
 pub use job::{

@@ -12,6 +12,7 @@ use serde::Serialize;
 
 use crate::bands::bands;
 use crate::depth_range::{choose_sampling, hypotheses, robust_range};
+use crate::focus::focus_ranges;
 use crate::options::PlanOptions;
 use crate::order::{order_views, symmetric_neighbours};
 use crate::size::working_size;
@@ -59,6 +60,8 @@ pub enum RangeOrigin {
     Points(usize),
     /// The sparse points of its best neighbours, because it sees too few itself; how many.
     NeighbourPoints(usize),
+    /// Where its optical axis meets those of other views, for want of points; how many.
+    Focus(usize),
 }
 
 /// Why a view gets no depth map.
@@ -88,9 +91,10 @@ const LENDING_NEIGHBOURS: usize = 4;
 
 /// Decides for every view what is to be done. Pure: the same scene and options give the same plan.
 pub fn plan(scene: &Scene, options: &PlanOptions) -> Plan {
-    let stated = stated_ranges(scene, options);
     let cameras = scene.undistorted_cameras();
-    let mut ranking = rank_sources(scene, &cameras, &stated);
+    let stated = stated_ranges(scene, &cameras, options);
+    let known = stated.iter().map(|(view, (range, _))| (*view, *range)).collect();
+    let mut ranking = rank_sources(scene, &cameras, &known);
     let seen = points_by_view(scene);
     let mut skipped = BTreeMap::new();
     let mut ranges = BTreeMap::new();
@@ -98,7 +102,7 @@ pub fn plan(scene: &Scene, options: &PlanOptions) -> Plan {
         let sources = ranking.get(&view).map_or(&[][..], Vec::as_slice);
         if sources.is_empty() {
             skipped.insert(view, SkipReason::Isolated);
-        } else if let Some(range) = range_of(&cameras[&view], options, &stated, &seen, &ranking, view) {
+        } else if let Some(range) = range_of(&cameras[&view], &stated, &seen, &ranking, view) {
             ranges.insert(view, range);
         } else {
             skipped.insert(view, SkipReason::NoDepthRange);
@@ -151,12 +155,26 @@ fn working_camera(camera: &Camera, options: &PlanOptions) -> Camera {
     Camera { intrinsics: camera.intrinsics.resized(width, height), ..*camera }
 }
 
-/// The depth ranges that need no points: the user's, or those of the scene's files.
-fn stated_ranges(scene: &Scene, options: &PlanOptions) -> BTreeMap<ViewId, DepthRange> {
+/// The depth ranges that need no points: the user's, those of the scene's files, or, where there are no
+/// points at all, those of the cameras' common focus.
+fn stated_ranges(
+    scene: &Scene,
+    cameras: &BTreeMap<ViewId, Camera>,
+    options: &PlanOptions,
+) -> BTreeMap<ViewId, (DepthRange, RangeOrigin)> {
     let is_valid = |range: &DepthRange| range.min > 0.0 && range.max > range.min && range.max.is_finite();
     let given = options.depth_range.map(|(min, max)| DepthRange { min, max, count: None });
+    let origin = if given.is_some() { RangeOrigin::Option } else { RangeOrigin::File };
     let views = scene.views.values();
-    views.filter_map(|view| Some((view.id, given.or(view.depth_range).filter(is_valid)?))).collect()
+    let mut ranges: BTreeMap<_, _> = views
+        .filter_map(|view| Some((view.id, (given.or(view.depth_range).filter(is_valid)?, origin))))
+        .collect();
+    if scene.points.is_empty() && ranges.len() < scene.views.len() {
+        for (view, (range, axes)) in focus_ranges(cameras) {
+            ranges.entry(view).or_insert((range, RangeOrigin::Focus(axes)));
+        }
+    }
+    ranges
 }
 
 /// The sparse points (world) that each view sees.
@@ -172,15 +190,13 @@ fn points_by_view(scene: &Scene) -> BTreeMap<ViewId, Vec<Point3<f64>>> {
 
 fn range_of(
     camera: &Camera,
-    options: &PlanOptions,
-    stated: &BTreeMap<ViewId, DepthRange>,
+    stated: &BTreeMap<ViewId, (DepthRange, RangeOrigin)>,
     seen: &BTreeMap<ViewId, Vec<Point3<f64>>>,
     ranking: &SourceRanking,
     view: ViewId,
 ) -> Option<(DepthRange, RangeOrigin)> {
-    if let Some(range) = stated.get(&view) {
-        let origin = if options.depth_range.is_some() { RangeOrigin::Option } else { RangeOrigin::File };
-        return Some((*range, origin));
+    if let Some(stated) = stated.get(&view) {
+        return Some(*stated);
     }
     let depth = |point: &Point3<f64>| camera.pose.to_camera(point).z;
     let own = seen.get(&view).map_or(&[][..], Vec::as_slice);

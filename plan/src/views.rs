@@ -30,7 +30,7 @@ pub fn angle_score(angle_deg: f64) -> f64 {
 }
 
 /// The angle at `point` between the two camera centres, in degrees.
-fn angle_deg(point: &Point3<f64>, centre_a: &Point3<f64>, centre_b: &Point3<f64>) -> f64 {
+pub(crate) fn angle_deg(point: &Point3<f64>, centre_a: &Point3<f64>, centre_b: &Point3<f64>) -> f64 {
     let (a, b) = (centre_a - point, centre_b - point);
     // atan2 stays exact for the small angles that matter here, where acos loses half its digits.
     a.cross(&b).norm().atan2(a.dot(&b)).to_degrees()

@@ -8,6 +8,7 @@ use base64::engine::general_purpose::STANDARD;
 use planesweep_scene::{Raster, Sampling, ViewId};
 use serde_json::Value;
 
+use crate::depth_histogram::plot_depth_histogram;
 use crate::picture::{PictureError, encode_jpeg, shrunk};
 use crate::{Funnel, RunReport, ViewReport};
 
@@ -19,6 +20,8 @@ pub struct Pictures {
     pub cloud: Option<Raster<[u8; 3]>>,
     /// Previews of views; not every view needs one.
     pub previews: BTreeMap<ViewId, Raster<[u8; 3]>>,
+    /// Depths (z, scene units) of the sparse points that views see, drawn against their ranges.
+    pub sparse_depths: BTreeMap<ViewId, Vec<f64>>,
 }
 
 /// Pictures of twice this width are halved.
@@ -54,7 +57,7 @@ pub fn render_html(report: &RunReport, pictures: &Pictures) -> Result<String, Pi
     push_skipped(&mut page, report);
     push(&mut page, format_args!("<h2>Views</h2>\n"));
     for view in &report.views {
-        push_view(&mut page, view, pictures.previews.get(&view.id))?;
+        push_view(&mut page, view, pictures)?;
     }
     push(&mut page, format_args!("<div class=\"columns\">\n<div>\n<h2>Settings</h2>\n"));
     push_table(&mut page, report.settings.iter().map(|(name, value)| (name.as_str(), plain(value))));
@@ -90,11 +93,7 @@ fn push_skipped(page: &mut String, report: &RunReport) {
     push_table(page, report.skipped.iter().map(|view| (view.name.as_str(), view.reason.clone())));
 }
 
-fn push_view(
-    page: &mut String,
-    view: &ViewReport,
-    preview: Option<&Raster<[u8; 3]>>,
-) -> Result<(), PictureError> {
+fn push_view(page: &mut String, view: &ViewReport, pictures: &Pictures) -> Result<(), PictureError> {
     let sampling = match view.sampling {
         Sampling::Uniform => "uniform",
         Sampling::Inverse => "inverse",
@@ -115,7 +114,10 @@ fn push_view(
         ),
     );
     push_warnings(page, &view.warnings);
-    if let Some(preview) = preview {
+    if let Some(depths) = pictures.sparse_depths.get(&view.id) {
+        push(page, format_args!("{}", plot_depth_histogram(depths, view.depth_min, view.depth_max)));
+    }
+    if let Some(preview) = pictures.previews.get(&view.id) {
         push(page, format_args!("{}", image(preview, &view.name)?));
     }
     push(
@@ -257,7 +259,7 @@ mod tests {
         report.versions.insert(evil.into(), evil.into());
         report.warnings.push(evil.into());
         let previews = BTreeMap::from([(report.views[0].id, Raster::filled(8, 8, [1; 3]))]);
-        let page = render_html(&report, &Pictures { cloud: None, previews }).expect("drawn");
+        let page = render_html(&report, &Pictures { previews, ..Pictures::default() }).expect("drawn");
         assert!(!page.contains("<script"));
         assert_eq!(
             page.matches("&lt;script&gt;alert(&quot;x&quot;)&lt;/script&gt;&#39; &amp; co.jpg").count(),
@@ -271,10 +273,12 @@ mod tests {
         let pictures = Pictures {
             cloud: Some(Raster::filled(40, 30, [90; 3])),
             previews: report.views.iter().map(|v| (v.id, Raster::filled(2400, 10, [50; 3]))).collect(),
+            sparse_depths: BTreeMap::from([(report.views[0].id, vec![report.views[0].depth_min])]),
         };
         let page = render_html(&report, &pictures).expect("drawn");
         assert_eq!(page.matches("src=\"data:image/jpeg;base64,").count(), 3);
         assert!(!page.contains("http"), "nothing is fetched");
+        assert_eq!(page.matches("<title>sparse points").count(), 1);
         for part in ["54\u{202f}600", "lonely.jpg", "min_confidence", "2 min 24 s", "80.4 %"] {
             assert!(page.contains(part), "{part} is missing");
         }

@@ -8,6 +8,7 @@
 mod cloud_picture;
 mod colormap;
 mod curve_plot;
+mod depth_histogram;
 mod event_file;
 mod font;
 mod html;
@@ -19,6 +20,7 @@ mod run_report;
 pub use cloud_picture::render_cloud;
 pub use colormap::{confidence_color, depth_color};
 pub use curve_plot::{Curve, plot_curves};
+pub use depth_histogram::plot_depth_histogram;
 pub use event_file::{event_file_start, scalar_event};
 pub use html::{Pictures, render_html};
 pub use picture::{PictureError, encode_png};

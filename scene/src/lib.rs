@@ -50,5 +50,6 @@ pub use training_sample::TrainingSample;
 pub use undistort::undistorted_intrinsics;
 pub use working_image::{PrepareError, WorkingImage};
 pub use write::{
-    WriteError, mvsnet_cam_text, mvsnet_pair_text, write_atomically, write_colmap, write_mvsnet,
+    Held, TargetFormat, WriteError, held, mvsnet_cam_text, mvsnet_pair_text, write_atomically, write_colmap,
+    write_colmap_text, write_mvsnet, write_openmvg, write_scene,
 };

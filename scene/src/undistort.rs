@@ -51,7 +51,7 @@ fn scaled_side(pixels: u32, centre: f64, before: f64, after: f64) -> (u32, f64) 
 }
 
 /// The image of the camera `pinhole`, which stands where that of `stored` does; bilinear, black outside.
-pub(crate) fn undistorted(
+pub(crate) fn resampled(
     stored: &Raster<[u8; 3]>,
     k: &Intrinsics,
     distortion: &Distortion,

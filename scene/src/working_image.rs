@@ -7,7 +7,7 @@ use fast_image_resize::pixels::U8x3;
 use fast_image_resize::{FilterType, ResizeAlg, ResizeOptions, Resizer};
 use thiserror::Error;
 
-use crate::undistort::undistorted;
+use crate::undistort::resampled;
 use crate::{Camera, Distortion, Raster, undistorted_intrinsics};
 
 /// An undistorted image at working size with its pinhole camera.
@@ -74,7 +74,7 @@ impl WorkingImage {
         let camera = Camera { intrinsics: pinhole.resized(width, height), pose: camera.pose };
         let pinhole = match distortion {
             Distortion::None => stored,
-            _ => undistorted(&stored, intrinsics, distortion, &pinhole),
+            _ => resampled(&stored, intrinsics, distortion, &pinhole),
         };
         Ok(Self { camera, pixels: resized(pinhole, width, height) })
     }

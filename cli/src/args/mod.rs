@@ -12,6 +12,7 @@ pub use self::inference::{NetworkArgs, PlanArgs};
 pub use self::scene::ReadArgs;
 use crate::commands::bench::BenchArgs;
 use crate::commands::bench::side::SideArgs;
+use crate::commands::convert::ConvertArgs;
 use crate::commands::depth::DepthArgs;
 use crate::commands::evaluate::EvaluateCommand;
 use crate::commands::inspect::InspectArgs;
@@ -49,6 +50,8 @@ pub enum Command {
     Reconstruct(ReconstructArgs),
     /// Say what would be done with a scene, and what is odd about it.
     Inspect(InspectArgs),
+    /// Write a scene in another format, and say what that cannot hold.
+    Convert(ConvertArgs),
     /// Infer the depth map of one view in this process.
     Depth(DepthArgs),
     /// Make a scene with exact ground truth, or training samples.

@@ -79,7 +79,8 @@ impl ReadArgs {
                 FormatArg::Bundler => SceneFormat::Bundler,
                 FormatArg::Openmvs => SceneFormat::OpenMvs,
             }),
-            images: self.images.clone(),
+            // Workers, and runs that resume, may have another working folder.
+            images: self.images.as_ref().map(|path| path.canonicalize().unwrap_or_else(|_| path.clone())),
             skip_bad_views: self.skip_bad_views,
             depth_line: match self.depth_line {
                 DepthLineArg::Auto => DepthLine::Auto,

@@ -6,14 +6,14 @@ use std::time::Instant;
 use anyhow::{Context, Result, bail};
 use bytes::Bytes;
 use planesweep_fusion::VERTEX_BYTES;
-use planesweep_plan::{BlobKey, Job, JobId, NUMERICS_VERSION, ViewPlan};
+use planesweep_plan::{BlobKey, Job, JobId, NUMERICS_VERSION, ViewPlan, sparse_depths};
 use planesweep_proto::{CODE_VERSION, JobResult, JobState};
 use planesweep_report::{
     Funnel, Pictures, RunReport, SkippedView, StageReport, Totals, ViewReport, encode_png, render_cloud,
     render_html,
 };
 use planesweep_scene::{
-    Camera, Raster, SourceScore, ViewId, mvsnet_cam_text, mvsnet_pair_text, write_atomically,
+    Camera, Raster, Scene, SourceScore, ViewId, mvsnet_cam_text, mvsnet_pair_text, write_atomically,
 };
 use planesweep_worker::{Store, decode_depth_map, decode_filtered_map};
 use rayon::prelude::*;
@@ -104,7 +104,7 @@ pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Out
     let record = record(run, &exported, &skipped, cloud_key, points);
     out.write_file(FILE_NAME, &serde_json::to_vec_pretty(&record).context("cannot write run.json")?)?;
     let report = report(run, &exported, &skipped, &stages, points, begun);
-    write_report(&out, &report, exported, &cloud)?;
+    write_report(&out, &run.prepared.input.scene, &report, exported, &cloud)?;
 
     let mut text = String::new();
     for (name, seconds) in &stages {
@@ -346,7 +346,13 @@ fn report(
     }
 }
 
-fn write_report(out: &OutFolder, report: &RunReport, views: Vec<ExportedView>, cloud: &[u8]) -> Result<()> {
+fn write_report(
+    out: &OutFolder,
+    scene: &Scene,
+    report: &RunReport,
+    views: Vec<ExportedView>,
+    cloud: &[u8],
+) -> Result<()> {
     out.write_file("report.json", report.to_json().context("cannot write report.json")?.as_bytes())?;
     let (width, height) = CLOUD_PICTURE;
     // As the middle view's photographer saw it.
@@ -356,6 +362,7 @@ fn write_report(out: &OutFolder, report: &RunReport, views: Vec<ExportedView>, c
         out.write_file("cloud.png", &encode_png(cloud)?)?;
     }
     let previews = views.into_iter().map(|view| (view.record.id, view.preview)).collect();
-    out.write_file("report.html", render_html(report, &Pictures { cloud, previews })?.as_bytes())?;
+    let pictures = Pictures { cloud, previews, sparse_depths: sparse_depths(scene) };
+    out.write_file("report.html", render_html(report, &pictures)?.as_bytes())?;
     Ok(())
 }

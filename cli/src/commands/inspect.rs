@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::Args;
 use planesweep_mvsnet::{InferRates, Refinement};
-use planesweep_plan::{Plan, RangeOrigin, ViewPlan, plan};
+use planesweep_plan::{Finding, Plan, RangeOrigin, Severity, ViewPlan, checkup, plan};
 use planesweep_scene::{Sampling, Scene};
 use serde_json::json;
 
@@ -48,17 +48,25 @@ pub fn run(args: &InspectArgs) -> Result<Outcome> {
     let plan = plan(&input.scene, &args.plan.options(Some(&args.filter)));
     let skipped = all_skipped(&input, &plan);
     let scene = &input.scene;
+    let left_out = input.skipped.iter().map(|view| (view.view.clone(), view.reason.clone())).collect();
     let mut text = format!(
         "{}: {} views, {} sparse points\n",
         args.scene.display(),
         scene.views.len(),
         scene.points.len()
     );
-    for warning in &scene.warnings {
-        text.push_str(&format!("warning: {warning}\n"));
+    let findings = checkup(scene, &left_out, &plan);
+    if findings.is_empty() {
+        text.push_str("nothing odd was found\n");
     }
-    for view in &skipped {
-        text.push_str(&format!("skipped: {}: {}\n", view.view, view.reason));
+    for Finding { severity, what, advice, .. } in &findings {
+        let severity = match severity {
+            Severity::Wrong => "wrong",
+            Severity::Lost => "lost",
+            Severity::Weak => "weak",
+            Severity::Note => "note",
+        };
+        text.push_str(&format!("{severity}: {what}\n      {advice}\n"));
     }
     let team = team(args, &plan)?;
     let forecast = Forecast::new(&plan, team, &InferRates::measure(team.threads)?);
@@ -77,6 +85,7 @@ pub fn run(args: &InspectArgs) -> Result<Outcome> {
         "sparse_points": scene.points.len(),
         "warnings": scene.warnings,
         "skipped": skipped,
+        "findings": findings,
         "plan": plan,
         "forecast": forecast,
     });
@@ -134,6 +143,7 @@ fn row(scene: &Scene, plan: &ViewPlan, forecast: &ViewForecast) -> Vec<String> {
             RangeOrigin::File => "file".to_owned(),
             RangeOrigin::Points(count) => format!("{count} points"),
             RangeOrigin::NeighbourPoints(count) => format!("{count} points of neighbours"),
+            RangeOrigin::Focus(count) => format!("{count} optical axes"),
         },
         format!(
             "{} {}",

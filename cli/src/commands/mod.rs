@@ -1,6 +1,7 @@
 //! One file per command.
 
 pub mod bench;
+pub mod convert;
 pub mod depth;
 pub mod evaluate;
 mod export;

@@ -4,11 +4,9 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::Path;
 
+use super::held::DEFAULT_PLANES;
 use super::{WriteError, create_folder, write_file};
 use crate::{Camera, DepthRange, Distortion, Scene, SourceScore, ViewId};
-
-/// Planes that a range is divided into where no number of planes is known, as in the paper.
-const DEFAULT_PLANES: u32 = 192;
 
 /// Writes `cams/00000000_cam.txt` for every view, by its id, and `pair.txt` below `root`; images
 /// are not copied. Distorted images are refused, for the format has no lens; sparse points, names
