@@ -38,6 +38,7 @@ fn main() -> ExitCode {
         Command::Evaluate(args) => commands::evaluate::run(&args),
         Command::Bench(args) => commands::bench::run(&args),
         Command::BenchSide(args) => commands::bench::side::run(&args),
+        Command::Benchmark(args) => commands::benchmark::run(&args, cli.verbose),
         Command::Worker(args) => commands::worker::run(args),
     };
     match done {

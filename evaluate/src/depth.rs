@@ -6,6 +6,8 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::statistics::{mean, median};
+
 /// Why depths cannot be compared.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum DepthError {
@@ -108,10 +110,9 @@ pub struct CurvePoint {
     pub kept: f64,
     /// The least confidence among them.
     pub min_confidence: f32,
-    /// Median of their relative errors.
-    pub median_relative: f64,
-    /// Mean of their relative errors.
-    pub mean_relative: f64,
+    /// Their errors.
+    #[serde(flatten)]
+    pub errors: ErrorStatistics,
 }
 
 /// Compares a depth map with the truth at each of its pixels; all three rasters are of one size (see
@@ -153,7 +154,7 @@ pub fn depth_error(
         truth_pixels,
         all: ErrorSummary { min_confidence: 0.0, ..summary(f32::NEG_INFINITY) },
         confident: options.min_confidences.iter().map(|c| summary(*c)).collect(),
-        curve: curve(&pixels, options.curve_points),
+        curve: curve(&pixels, options.curve_points, options.hypotheses.is_some()),
     })
 }
 
@@ -239,39 +240,18 @@ impl ErrorStatistics {
 }
 
 /// `points` shares in equal steps up to 1 of `pixels`, which are sorted by falling confidence.
-fn curve(pixels: &[PixelError], points: usize) -> Vec<CurvePoint> {
+fn curve(pixels: &[PixelError], points: usize, with_intervals: bool) -> Vec<CurvePoint> {
     (1..=points)
         .into_par_iter()
         .filter_map(|point| {
             let kept = &pixels[..(pixels.len() * point).div_ceil(points)];
-            let mut relative: Vec<f64> = kept.iter().map(|p| p.relative).collect();
             Some(CurvePoint {
                 kept: kept.len() as f64 / pixels.len() as f64,
                 min_confidence: kept.last()?.confidence,
-                mean_relative: mean(&relative)?,
-                median_relative: median(&mut relative)?,
+                errors: ErrorStatistics::of(kept, with_intervals)?,
             })
         })
         .collect()
-}
-
-fn mean(values: &[f64]) -> Option<f64> {
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
-}
-
-/// The middle value, or the mean of the two middle ones; changes the order of `values`.
-fn median(values: &mut [f64]) -> Option<f64> {
-    if values.is_empty() {
-        return None;
-    }
-    let (middle, odd) = (values.len() / 2, values.len() % 2 == 1);
-    let (below, upper, _) = values.select_nth_unstable_by(middle, f64::total_cmp);
-    let upper = *upper;
-    if odd {
-        return Some(upper);
-    }
-    let lower = below.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    Some(f64::midpoint(lower, upper))
 }
 
 #[cfg(test)]
@@ -318,19 +298,10 @@ mod tests {
         assert_eq!(confident.errors.expect("three pixels").median_relative, 0.015625);
         let none = ErrorSummary { min_confidence: 0.99, pixels: 0, coverage: 0.0, errors: None };
         assert_eq!(errors.confident[1], none);
-        let half = CurvePoint {
-            kept: 0.5,
-            min_confidence: 0.9,
-            median_relative: 0.0078125,
-            mean_relative: 0.0078125,
-        };
-        let whole = CurvePoint {
-            kept: 1.0,
-            min_confidence: 0.1,
-            median_relative: 0.0234375,
-            mean_relative: 0.07421875,
-        };
-        assert_eq!(errors.curve, [half, whole]);
+        let [half, whole] = errors.curve[..] else { panic!("two points, not {:?}", errors.curve) };
+        assert_eq!((half.kept, half.min_confidence), (0.5, 0.9));
+        assert_eq!((half.errors.median_relative, half.errors.within_1_percent), (0.0078125, 0.5));
+        assert_eq!((whole.kept, whole.min_confidence, whole.errors), (1.0, 0.1, all));
     }
 
     #[test]
@@ -380,15 +351,6 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_median_is_the_middle_of_the_sorted_values(values in prop::collection::vec(-9.0..9.0_f64, 1..40)) {
-            let mut sorted = values.clone();
-            sorted.sort_by(f64::total_cmp);
-            let n = sorted.len();
-            let expected = f64::midpoint(sorted[(n - 1) / 2], sorted[n / 2]);
-            prop_assert!((median(&mut values.clone()).expect("values") - expected).abs() < 1e-12);
-        }
-
-        #[test]
         fn reports_hold_together(
             pixels in prop::collection::vec((-0.5..9.0_f32, -0.5..9.0_f32, 0.0..1.0_f32), 1..200),
             scale in 0.1..10.0_f32,
@@ -404,7 +366,7 @@ mod tests {
                 prop_assert!(errors.within_1_percent <= errors.within_2_percent);
                 prop_assert!(errors.within_2_percent <= errors.within_5_percent);
                 let last = report.curve.last().expect("a curve");
-                prop_assert_eq!((last.kept, last.median_relative), (1.0, errors.median_relative));
+                prop_assert_eq!((last.kept, last.errors), (1.0, errors));
                 prop_assert!(report.curve.windows(2).all(|w| w[0].kept <= w[1].kept));
                 prop_assert!(report.curve.windows(2).all(|w| w[0].min_confidence >= w[1].min_confidence));
                 // Relative errors do not depend on the unit of the scene.

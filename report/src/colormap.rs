@@ -18,6 +18,20 @@ pub fn confidence_color(t: f32) -> [u8; 3] {
     lookup(&TABLE, t)
 }
 
+/// The colour of an error: `t` is 0 (white) over orange to 1 (dark red); outside it is clamped.
+pub fn error_color(t: f32) -> [u8; 3] {
+    static TABLE: LazyLock<[[u8; 3]; STEPS]> = LazyLock::new(|| table(white_to_red));
+    lookup(&TABLE, t)
+}
+
+/// Lightness falls evenly while the colour gets stronger and turns from yellow to red.
+fn white_to_red(t: f32) -> [f32; 3] {
+    let lightness = 0.99 - 0.62 * t;
+    let hue = (90.0 - 62.0 * t) / 360.0 * TAU;
+    let chroma = 0.16 * (1.0 - (1.0 - t).powi(3));
+    [lightness, chroma * hue.cos(), chroma * hue.sin()]
+}
+
 /// Lightness rises evenly while the hue turns from violet over blue and green to yellow; chroma is
 /// least in the teal, where sRGB reaches least far.
 fn violet_to_yellow(t: f32) -> [f32; 3] {
@@ -81,7 +95,7 @@ mod tests {
 
     #[test]
     fn lightness_rises_all_the_way() {
-        for map in [depth_color, confidence_color] {
+        for map in [depth_color, confidence_color, |t: f32| error_color(1.0 - t)] {
             let values: Vec<f32> = (0..=32).map(|i| lightness(map(i as f32 / 32.0))).collect();
             for pair in values.windows(2) {
                 let step = pair[1] - pair[0];

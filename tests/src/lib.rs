@@ -6,6 +6,7 @@
 #![allow(clippy::missing_panics_doc, reason = "a helper that cannot do its work fails the test")]
 
 mod bench;
+pub mod benchmarks;
 mod convert_middlebury;
 mod convert_rgbd;
 mod data;

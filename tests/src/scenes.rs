@@ -34,7 +34,9 @@ pub fn plane_of_size(folder: &Path, views: u32, width: u32, height: u32) -> Scen
         let image = images.join(&name);
         let pixel = |x: u32, y: u32| image::Rgb([(x ^ y) as u8, (x * y + k) as u8, (3 * x + 7 * y) as u8]);
         RgbImage::from_fn(width, height, pixel).save(&image).expect("written");
-        let (centre, target) = (Point3::new(0.25 * k as f64, 0.1, 0.0), Point3::new(0.5, 0.0, 5.0));
+        // Not on one line, so that the trajectory fixes a similarity.
+        let (x, y) = (0.25 * k as f64, 0.1 + 0.15 * (k % 3) as f64);
+        let (centre, target) = (Point3::new(x, y, 0.0), Point3::new(0.5, 0.0, 5.0));
         let pose = Pose::look_at(&centre, &target, &-Vector3::y());
         let view = View {
             id: ViewId(k),

@@ -13,6 +13,7 @@ pub use self::scene::ReadArgs;
 use crate::commands::bench::BenchArgs;
 use crate::commands::bench::side::SideArgs;
 use crate::commands::convert::ConvertArgs;
+use crate::commands::benchmark::BenchmarkArgs;
 use crate::commands::depth::DepthArgs;
 use crate::commands::evaluate::EvaluateCommand;
 use crate::commands::inspect::InspectArgs;
@@ -71,6 +72,8 @@ pub enum Command {
     /// One side of a bench; answers requests on standard input.
     #[command(hide = true)]
     BenchSide(SideArgs),
+    /// Reconstruct and evaluate the scenes of a benchmark, beside the published figures.
+    Benchmark(BenchmarkArgs),
     /// Work for a coordinator until it says stop.
     Worker(WorkerArgs),
 }

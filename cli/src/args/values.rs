@@ -12,6 +12,12 @@ pub fn positive(text: &str) -> Result<f32, String> {
     if value > 0.0 && value.is_finite() { Ok(value) } else { Err(format!("{text} is not positive")) }
 }
 
+/// A positive, finite length in 64 bits: thresholds are compared with distances of that precision.
+pub fn length(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| format!("{text} is not a number"))?;
+    if value > 0.0 && value.is_finite() { Ok(value) } else { Err(format!("{text} is not positive")) }
+}
+
 /// Two depths, `NEAR,FAR`.
 pub fn depth_range(text: &str) -> Result<(f64, f64), String> {
     let number = |text: &str| text.trim().parse::<f64>().map_err(|_| format!("{text} is not a number"));

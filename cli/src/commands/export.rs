@@ -89,6 +89,9 @@ pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Out
         views.par_iter().map(|view| export_view(run, &out, view)).collect::<Result<_>>()?;
     let exported: Vec<ExportedView> = exported.into_iter().flatten().collect();
     write_mvsnet_side(&out, &exported)?;
+    // Tanks and Temples matches cameras by their order, so those without a depth map are in it, too.
+    let cameras = run.prepared.input.scene.views.values().map(|view| &view.camera);
+    out.write_file("trajectory.log", trajectory(cameras).as_bytes())?;
     let skipped = skipped_views(run);
     let (cloud_key, cloud) = write_cloud(run, &out)?;
     let points = vertices(&cloud).count() as u64;
@@ -216,7 +219,7 @@ fn failure(result: &JobResult) -> Option<String> {
     Some(format!("{}: {message}", result.kind))
 }
 
-/// Cameras, pairs and trajectory, as users of MVSNet folders and of Tanks and Temples want them.
+/// Cameras and pairs, as users of MVSNet folders want them.
 fn write_mvsnet_side(out: &OutFolder, views: &[ExportedView]) -> Result<()> {
     let mut pairs = BTreeMap::new();
     let exported: BTreeSet<ViewId> = views.iter().map(|view| view.record.id).collect();
@@ -230,8 +233,6 @@ fn write_mvsnet_side(out: &OutFolder, views: &[ExportedView]) -> Result<()> {
         pairs.insert(record.id, scored.collect());
     }
     out.write_file("pair.txt", mvsnet_pair_text(&pairs).as_bytes())?;
-    let cameras = views.iter().map(|view| &view.record.depth_camera);
-    out.write_file("trajectory.log", trajectory(cameras).as_bytes())?;
     Ok(())
 }
 

@@ -2,6 +2,7 @@
 
 pub mod bench;
 pub mod convert;
+pub mod benchmark;
 pub mod depth;
 pub mod evaluate;
 mod export;
