@@ -29,6 +29,7 @@ pub use example::{Example, ExampleError, Recipe, SampleShape};
 pub use feeder::{FeedError, SampleError, SampleSource};
 pub use network::KernelEngine;
 pub use optimizer::{GradientNorm, TrainState};
+pub use parameters::{Tensors, initial as initial_weights};
 #[cfg(feature = "torch")]
 pub use torch_engine::TorchEngine;
 pub use trainer::{StepReport, TrainError, TrainEvent, Trainer, Wish};

@@ -10,7 +10,7 @@ use crate::weights::{fan_in, layout};
 use crate::{WeightTensor, Weights, WeightsError, WeightsMetadata};
 
 /// Tensors by name, such as weights, gradients or moments.
-pub(crate) type Tensors = BTreeMap<String, WeightTensor>;
+pub type Tensors = BTreeMap<String, WeightTensor>;
 
 /// Whether a tensor is a statistic of batch normalisation, which no gradient changes.
 pub(crate) fn is_statistic(name: &str) -> bool {
@@ -41,7 +41,7 @@ pub(crate) fn metadata(
 
 /// Weights to begin with: kernels uniform with the bound of He et al. (2015), batch normalisation the identity,
 /// biases zero, and the refinement's last kernel small, so that refined depth begins as the initial one.
-pub(crate) fn initial(network: NetworkConfig, seed: u64) -> Tensors {
+pub fn initial(network: NetworkConfig, seed: u64) -> Tensors {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let tensors = layout::tensors(&metadata(network, &AboutConfig::default(), None));
     let tensor = |(name, shape): (String, Vec<usize>)| {
