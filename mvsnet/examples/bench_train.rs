@@ -64,7 +64,8 @@ fn example(network: NetworkConfig, [width, height]: [usize; 2], depths: u32, vie
         let (cx, cy) = ((width - 1) as f64 / 2.0, (height - 1) as f64 / 2.0);
         let intrinsics =
             Intrinsics { width: width as u32, height: height as u32, fx, fy: fx, skew: 0.0, cx, cy };
-        let centre = Point3::new(0.4 * i.div_ceil(2) as f64 * if i % 2 == 0 { 1.0 } else { -1.0 }, 0.0, 0.0);
+        let centre =
+            Point3::new(0.4 * i.div_ceil(2) as f64 * if i.is_multiple_of(2) { 1.0 } else { -1.0 }, 0.0, 0.0);
         Camera { intrinsics, pose: Pose::look_at(&centre, &Point3::new(0.0, 0.0, 4.0), &-Vector3::y()) }
     };
     let view = |i: usize| WorkingImage {

@@ -89,9 +89,9 @@ impl PlanArgs {
 #[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Network")]
 pub struct NetworkArgs {
-    /// The weights, as `weights import` writes them.
+    /// The weights, as `weights import` and `train` write them; by default those that come with the program.
     #[arg(long, env = "PLANESWEEP_WEIGHTS", value_name = "FILE")]
-    pub weights: PathBuf,
+    pub weights: Option<PathBuf>,
     /// Where to infer: cpu, torch (the plain network of libtorch on the processor), cuda or cuda:N.
     #[arg(long, default_value = "cpu")]
     pub device: String,

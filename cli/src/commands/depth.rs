@@ -16,7 +16,7 @@ use crate::args::values::pixel;
 use crate::args::{NetworkArgs, PlanArgs, ReadArgs};
 use crate::console::Outcome;
 use crate::input;
-use crate::network::{processors, read_weights};
+use crate::network::{processors, weights_or_default};
 use crate::out_folder::{MapFiles, OutFolder};
 
 /// Arguments of `depth`.
@@ -50,7 +50,7 @@ pub fn run(args: &DepthArgs) -> Result<Outcome> {
     }
     let plan = plan(&scene, &args.plan.options(None));
     let view = find(&scene, &plan, &args.view)?;
-    let (_, weights) = read_weights(&args.network.weights)?;
+    let (_, weights) = weights_or_default(args.network.weights.as_deref())?;
 
     let begun = Instant::now();
     let ids: Vec<ViewId> = std::iter::once(view.view).chain(view.sources.iter().copied()).collect();
@@ -126,7 +126,8 @@ pub(super) fn find<'a>(scene: &Scene, plan: &'a Plan, wanted: &str) -> Result<&'
     plan.views.iter().find(|view| view.view == known.id).context("the plan leaves the view out")
 }
 
-fn working_image(scene: &Scene, plan: &Plan, id: ViewId) -> Result<WorkingImage> {
+/// The image of a view as the network takes it.
+pub fn working_image(scene: &Scene, plan: &Plan, id: ViewId) -> Result<WorkingImage> {
     let view = &scene.views[&id];
     let size = undistorted_intrinsics(&view.camera.intrinsics, &view.distortion);
     let (width, height) = working_size(size.width, size.height, plan.options.max_size);

@@ -17,7 +17,9 @@ use super::export::{self, Finished};
 use crate::args::{FilterArgs, NetworkArgs, PlanArgs, ReadArgs};
 use crate::console::{Outcome, Progress};
 use crate::input::{self, Input};
-use crate::network::{Placement, backend_factory, default_workers, processors, read_weights, weights_for};
+use crate::network::{
+    Placement, backend_factory, default_workers, processors, weights_for, weights_or_default,
+};
 use crate::supervisor::Supervisor;
 
 /// Arguments of `reconstruct`.
@@ -79,7 +81,7 @@ struct Team {
 pub fn run(args: &ReconstructArgs, json: bool, verbose: u8) -> Result<Outcome> {
     let begun = Instant::now();
     let mut stages = Stages::new();
-    let (weights_bytes, weights) = read_weights(&args.network.weights)?;
+    let (weights_bytes, weights) = weights_or_default(args.network.weights.as_deref())?;
     let weights_bytes = weights_for(&args.network.device, weights_bytes);
     // The workers make their own; this one only says at once when the device is not there.
     let placement = Placement { device: args.network.device.clone(), threads: 1, memory_bytes: None };

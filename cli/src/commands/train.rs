@@ -14,7 +14,7 @@ use planesweep_scene::write_atomically;
 use serde_json::json;
 
 use crate::console::Outcome;
-use crate::training::{Curves, Stop, SynthSamples};
+use crate::training::{Curves, Stop, SynthSamples, add_scene};
 
 /// Arguments of `train`.
 #[derive(Debug, Args)]
@@ -50,7 +50,10 @@ pub fn run(args: &TrainArgs) -> Result<Outcome> {
     write(&out.join(CONFIG), effective.as_bytes())?;
 
     let source = SynthSamples;
-    let validation = ValidationSet::held_out(&source, &config).context("cannot make held-out samples")?;
+    let mut validation = ValidationSet::held_out(&source, &config).context("cannot make held-out samples")?;
+    for scene in &config.progress.validation_scenes {
+        add_scene(&mut validation, Path::new(scene))?;
+    }
     let mut trainer = Trainer::new(&config, &checkpoint, engine(&config)?)?;
     let stop = Stop::on_signals()?;
     let mut curves = None;

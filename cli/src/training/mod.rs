@@ -2,8 +2,10 @@
 
 mod curves;
 mod samples;
+mod scenes;
 mod stop;
 
 pub use self::curves::Curves;
 pub use self::samples::SynthSamples;
+pub use self::scenes::add_scene;
 pub use self::stop::Stop;

@@ -1,6 +1,7 @@
 //! Weights of the network: named tensors, and what must be known to use them rightly.
 
 mod checkpoint;
+mod embedded;
 mod file;
 mod folded;
 pub(crate) mod layout;

@@ -1,0 +1,82 @@
+//! Training through the program: a run that is killed goes on to the same bytes.
+
+use std::fs;
+use std::path::Path;
+use std::time::Duration;
+
+use planesweep_tests::{Running, wait_until};
+
+const CONFIG: &str = r#"
+seed = 5
+steps = 8
+threads = 2
+
+[samples]
+sizes = [[64, 64], [96, 64]]
+views = [2, 3]
+depths = [8, 16]
+
+[network]
+refinement = "paper"
+
+[optimizer]
+warmup = 2
+samples_per_step = 2
+average_decay = 0.9
+freeze_statistics_at = 6
+
+[progress]
+log_every = 1
+checkpoint_every = 2
+validate_every = 4
+validation_samples = 1
+"#;
+
+fn start(config: &Path, out: &Path) -> Running {
+    Running::start(["train".as_ref(), config.as_os_str(), "-o".as_ref(), out.as_os_str(), "--json".as_ref()])
+}
+
+#[test]
+fn a_killed_run_goes_on_to_the_same_weights() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let config = folder.path().join("train.toml");
+    fs::write(&config, CONFIG).expect("written");
+    let (whole, killed) = (folder.path().join("whole"), folder.path().join("killed"));
+    let finished = start(&config, &whole).wait().expect_code(0);
+    assert_eq!(finished.json()["steps"], 8);
+
+    let running = start(&config, &killed);
+    // After a checkpoint, and with steps since then that are lost.
+    let there = wait_until(Duration::from_mins(10), || running.stderr().contains("step 3/8"));
+    assert!(there, "{}", running.stderr());
+    drop(running);
+    assert!(!fs::read_to_string(killed.join("curve.csv")).expect("a curve").contains("\n8,"));
+
+    let finished = start(&config, &killed).wait().expect_code(0);
+    assert!(finished.stderr.contains("going on after step"), "{}", finished.stderr);
+    for file in ["weights.safetensors", "checkpoint.safetensors"] {
+        let read = |run: &Path| fs::read(run.join(file)).expect("a file of the run");
+        assert!(read(&whole) == read(&killed), "{file} differs");
+    }
+    let curve = |run: &Path| fs::read_to_string(run.join("curve.csv")).expect("a curve").lines().count();
+    assert_eq!((curve(&whole), curve(&killed)), (9, 9));
+    assert!(whole.join("loss.png").exists() && whole.join("errors.png").exists());
+}
+
+#[test]
+fn another_configuration_and_nonsense_are_refused() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let config = folder.path().join("train.toml");
+    let out = folder.path().join("out");
+    for (text, complaint) in [
+        ("steps = 0", "steps must be at least 1"),
+        ("stepz = 5", "unknown field `stepz`"),
+        ("[samples]\nsizes = [[60, 64]]", "samples.sizes must be multiples of 32"),
+        ("device = \"abacus\"", "\"abacus\" is none of"),
+    ] {
+        let few = format!("{text}\n");
+        fs::write(&config, few).expect("written");
+        let finished = start(&config, &out).wait().expect_code(1);
+        assert!(finished.stderr.contains(complaint), "{text}: {}", finished.stderr);
+    }
+}
