@@ -6,6 +6,7 @@
 mod args;
 mod commands;
 mod console;
+mod depth_maps;
 mod forecast;
 mod input;
 mod network;
@@ -31,6 +32,7 @@ fn main() -> ExitCode {
         Command::Inspect(args) => commands::inspect::run(&args),
         Command::Convert(args) => commands::convert::run(&args),
         Command::Depth(args) => commands::depth::run(&args),
+        Command::Fuse(args) => commands::fuse::run(&args, json),
         Command::Synth(args) => commands::synth::run(&args),
         Command::Train(args) => commands::train::run(&args),
         Command::RenderDepth(args) => commands::render_depth::run(&args),

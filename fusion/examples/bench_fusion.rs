@@ -14,7 +14,9 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::Instant;
 
 use nalgebra::{Point2, Point3, Vector3};
-use planesweep_fusion::{FilterOptions, FilteredMap, FusionMethod, emit, emitted, encode, filter};
+use planesweep_fusion::{
+    FilterOptions, FilteredMap, FusionMethod, VertexFormat, emit, emitted, encode, filter,
+};
 use planesweep_scene::{Camera, DepthMap, Intrinsics, Pose, Raster};
 
 const NEIGHBOURS: usize = 10;
@@ -54,7 +56,9 @@ fn methods(maps: &[DepthMap], runs: usize) {
         }
         let filtered = fuse(maps, FusionMethod::Consistency);
         let others = [&filtered; NEIGHBOURS];
-        emit_ms.push(milliseconds(|| encode(&emit(&filtered, &emitted(&filtered, &others, 0.01)))));
+        emit_ms.push(milliseconds(|| {
+            encode(&emit(&filtered, &emitted(&filtered, &others, 0.01)), VertexFormat::default())
+        }));
     }
     for (method, (all, one)) in METHODS.into_iter().zip(&times) {
         let funnel = fuse(maps, method).funnel;

@@ -20,6 +20,8 @@ pub struct Point {
     pub confidence: f32,
     /// How many views agree on it, 255 meaning that or more; 0 when unknown.
     pub views: u8,
+    /// Which neighbours of the view that emits it are among those: bit k is the one at index k.
+    pub seen_by: u64,
 }
 
 /// The points of the pixels of a filtered depth map that `emitted` marks (of its size; see
@@ -39,6 +41,7 @@ pub fn emit(map: &FilteredMap, emitted: &Raster<bool>) -> Vec<Point> {
                         color: map.color.at(x, y),
                         confidence: map.confidence.at(x, y) as f32 / 255.0,
                         views: map.views.at(x, y),
+                        seen_by: map.agreeing.at(x, y),
                     }
                 })
                 .collect()

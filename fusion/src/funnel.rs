@@ -69,6 +69,18 @@ pub struct EmptyCloud {
 }
 
 impl Funnel {
+    /// The steps in order, each with its name and what it left.
+    pub fn steps(&self) -> [(&'static str, u64); 6] {
+        [
+            ("pixels", self.pixels),
+            ("with a depth", self.with_depth),
+            ("photometric", self.photometric),
+            ("visible", self.visible),
+            ("geometric", self.geometric),
+            ("emitted", self.emitted),
+        ]
+    }
+
     /// The first step that left nothing; `None` when points remain.
     pub fn emptied_by(&self) -> Option<EmptyCloud> {
         let steps = [

@@ -9,7 +9,9 @@
 //! - [`normals`] are the gradients of what is left;
 //! - [`emit`] makes points of it;
 //! - [`PlyWriter`] streams them to disk in the layout of COLMAP's `fused.ply`, [`read_ply`] reads
-//!   such files back.
+//!   such files back; [`LasWriter`] and [`VisibilityWriter`] write what others want.
+//!
+//! [`fuse_out_of_core`] does all of it for any number of views in bounded memory.
 //!
 //! All of it is deterministic for any number of threads.
 
@@ -21,20 +23,29 @@ mod cloud;
 mod color;
 mod dynamic;
 mod filter;
+mod filtered_bytes;
 mod funnel;
 mod geometric;
 mod hypotheses;
+mod las;
 mod normals;
 mod options;
+mod out_of_core;
+mod output;
 mod photometric;
 mod ply;
 mod surface;
+mod vis;
 mod visibility;
 
 pub use cloud::{Point, emit};
 pub use filter::{FilteredMap, MAX_RECORDED, filter};
+pub use filtered_bytes::{FilteredMapError, decode_filtered_map, encode_filtered_map};
 pub use funnel::{EmptyCloud, FilterStep, Funnel};
+pub use las::{LasError, LasWriter};
 pub use normals::normals;
-pub use options::{DepthSampling, FilterOptions, FusionMethod};
-pub use ply::{PlyError, PlyWriter, VERTEX_BYTES, encode, ply_header, read_ply};
+pub use options::{DepthSampling, FilterOptions, FusionMethod, Preset};
+pub use out_of_core::{Fused, LoadError, LoadMap, OutOfCoreError, ViewPoints, Work, fuse_out_of_core};
+pub use ply::{PlyError, PlyWriter, VertexFormat, encode, ply_header, read_ply};
 pub use surface::emitted;
+pub use vis::{VisibilityError, VisibilityWriter};

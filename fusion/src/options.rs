@@ -35,6 +35,29 @@ impl Default for FilterOptions {
     }
 }
 
+/// The thresholds of evaluation scripts that are in common use.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Preset {
+    /// The public PyTorch port of MVSNet: confidence 0.8, three sources within 1 pixel and 1 %.
+    MvsNet,
+    /// CasMVSNet and those that took its script over: confidence 0.9, five sources within 1 pixel and 1 %.
+    CasMvsNet,
+    /// D2HC-RMVSNet: confidence 0.3, dynamic consistency of two sources and more.
+    Dynamic,
+}
+
+impl Preset {
+    /// Its thresholds. Scripts count sources, so `min_views` is one more.
+    pub fn options(self) -> FilterOptions {
+        let (method, min_confidence, min_views) = match self {
+            Self::MvsNet => (FusionMethod::Consistency, 0.8, 4),
+            Self::CasMvsNet => (FusionMethod::Consistency, 0.9, 6),
+            Self::Dynamic => (FusionMethod::Dynamic, 0.3, 3),
+        };
+        FilterOptions { method, min_confidence, min_views, ..FilterOptions::default() }
+    }
+}
+
 /// What decides whether a depth is kept, and which.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

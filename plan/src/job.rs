@@ -103,6 +103,8 @@ pub struct EmitSpec {
     pub neighbours: Vec<ViewId>,
     /// Two depths that differ by less, relatively, are the same surface.
     pub max_relative_depth: f32,
+    /// Whether positions are written as doubles, for scenes far from their origin.
+    pub double: bool,
 }
 
 /// The cloud. Needs the `Emit` jobs of all views, in order.

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use planesweep_fusion::{DepthSampling, FusionMethod};
+use planesweep_fusion::{DepthSampling, FusionMethod, VertexFormat};
 use planesweep_scene::{Camera, DepthHypotheses, Sampling, Scene, ViewId};
 use thiserror::Error;
 
@@ -96,8 +96,12 @@ pub fn jobs(
     });
     let filtered = filter.iter().filter_map(|job| Some((job.spec.view()?, job.id))).collect();
     let max_relative_depth = options.max_relative_depth;
+    // The whole cloud has one format.
+    let double = plan.views.iter().any(|view| {
+        VertexFormat::needs_doubles(&scene.views[&view.view].camera, Some(view.hypotheses.min()))
+    });
     let emit = by_neighbourhood(&filtered, plan.options.once_per_surface, &|view, neighbours| {
-        JobSpec::Emit(EmitSpec { view, neighbours, max_relative_depth })
+        JobSpec::Emit(EmitSpec { view, neighbours, max_relative_depth, double })
     });
     // The cloud is in the order of view ids, which does not change when the plan's order does.
     let mut emitted: Vec<(ViewId, JobId)> =
@@ -144,7 +148,10 @@ fn job(spec: JobSpec, needs: Vec<JobId>) -> Job {
                 DepthSampling::Continuous => 1,
             });
         }
-        JobSpec::Emit(emit) => digest.f64(emit.max_relative_depth as f64),
+        JobSpec::Emit(emit) => {
+            digest.f64(emit.max_relative_depth as f64);
+            digest.u32(u32::from(emit.double));
+        }
         JobSpec::Stitch(_) | JobSpec::Assemble(_) => {}
     }
     digest.u32(needs.len() as u32);
@@ -279,6 +286,14 @@ mod tests {
         let every_view = jobs_of(&scene(), &every_view, b"w");
         assert_eq!(ids(&plain).intersection(&ids(&every_view)).count(), 8, "inference and filter stay");
         assert!(every_view[8..12].iter().all(|job| job.needs.len() == 1));
+
+        let mut georeferenced = scene();
+        for view in georeferenced.views.values_mut() {
+            view.camera.pose.translation.x += 5e6;
+        }
+        let doubles = jobs_of(&georeferenced, &PlanOptions::default(), b"w");
+        assert!(doubles.iter().all(|job| !matches!(&job.spec, JobSpec::Emit(emit) if !emit.double)));
+        assert!(plain.iter().all(|job| !matches!(&job.spec, JobSpec::Emit(emit) if emit.double)));
 
         let mut bent = scene();
         bent.views.get_mut(&ViewId(0)).expect("exists").distortion = Distortion::Radial { k1: 0.1, k2: 0.0 };

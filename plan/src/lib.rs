@@ -29,6 +29,7 @@ pub use job::{
 };
 pub use jobs::{JobsError, jobs};
 pub use options::{MAX_DEPTHS, MIN_DEPTHS, PlanOptions, SamplingChoice};
+pub use order::{order_views, symmetric_neighbours};
 pub use plan::{Plan, RangeOrigin, SkipReason, ViewPlan, plan};
 pub use size::working_size;
 pub use views::{SourceRanking, angle_score, rank_sources};

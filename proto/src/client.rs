@@ -153,6 +153,7 @@ mod tests {
                 view: ViewId(k),
                 neighbours: vec![ViewId(1); 500],
                 max_relative_depth: 0.01,
+                double: false,
             });
             Job { id: JobId(id), spec, needs: vec![JobId([1; 32]); 500] }
         };

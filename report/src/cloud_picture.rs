@@ -11,7 +11,7 @@ const SPLAT_SHARE: f64 = 1.0 / 400.0;
 /// Draws points (position in the world, colour) as `camera` would see them, in a picture of `width` by
 /// `height`; the camera's image is stretched to that size. The nearest point hides those behind it.
 pub fn render_cloud(
-    points: impl IntoIterator<Item = ([f32; 3], [u8; 3])>,
+    points: impl IntoIterator<Item = ([f64; 3], [u8; 3])>,
     camera: &Camera,
     width: u32,
     height: u32,
@@ -27,7 +27,7 @@ pub fn render_cloud(
         first.max(0.0) as usize..((first + side).max(0.0) as usize).min(length)
     };
     for (position, color) in points {
-        let Some((pixel, depth)) = camera.project(&Point3::from(position.map(f64::from))) else { continue };
+        let Some((pixel, depth)) = camera.project(&Point3::from(position)) else { continue };
         let depth = depth as f32;
         for y in span(pixel.y, rows) {
             for x in span(pixel.x, columns) {
@@ -62,7 +62,7 @@ mod tests {
             ([0.205, -0.195, 1.0], blue),
             ([0.0, 0.0, -1.0], green),
             ([1e30, 0.0, 1.0], green),
-            ([f32::NAN, 0.0, 1.0], green),
+            ([f64::NAN, 0.0, 1.0], green),
         ];
         let picture = render_cloud(points, &camera, 100, 80);
         assert_eq!((picture.at(50, 40), picture.at(70, 20)), (red, blue));

@@ -16,6 +16,7 @@
 #![warn(missing_docs)]
 
 mod camera;
+mod depth_files;
 mod depth_map;
 mod distortion;
 mod hypotheses;
@@ -33,6 +34,7 @@ mod working_image;
 mod write;
 
 pub use camera::{Camera, CameraError, Intrinsics, Pose};
+pub use depth_files::{DepthFiles, DepthFilesError, MapGeometry, find_depth_files, find_mask};
 pub use depth_map::{DepthMap, DepthMapError};
 pub use distortion::Distortion;
 pub use hypotheses::{DepthHypotheses, HypothesesError, Sampling};

@@ -6,12 +6,11 @@
 //! ```
 
 use nalgebra::{Matrix3, Vector3};
-use planesweep_fusion::{FilteredMap, Funnel, VERTEX_BYTES};
+use planesweep_fusion::{FilteredMapError, Funnel, VertexFormat};
 use planesweep_scene::{Camera, CameraError, DepthMap, DepthMapError, Intrinsics, Pose, Raster};
 use thiserror::Error;
 
 const DEPTH_MAP: [u8; 8] = *b"PSDEPTH1";
-const FILTERED_MAP: [u8; 8] = *b"PSFILTR2";
 const POINTS: [u8; 8] = *b"PSPOINT2";
 /// Longest side of a map that is read; a header that says more is damaged.
 const MAX_SIDE: u32 = 1 << 17;
@@ -36,6 +35,9 @@ pub enum BlobError {
     /// The camera in the header is none.
     #[error("blob has no valid camera")]
     Camera(#[from] CameraError),
+    /// The filtered map in it is none.
+    #[error(transparent)]
+    FilteredMap(#[from] FilteredMapError),
     /// The parts do not fit together.
     #[error("blob is no depth map")]
     DepthMap(#[from] DepthMapError),
@@ -62,71 +64,35 @@ pub fn decode_depth_map(bytes: &[u8]) -> Result<DepthMap, BlobError> {
     Ok(DepthMap::new(camera, depth, confidence, color)?)
 }
 
-/// A filtered map as bytes.
-pub fn encode_filtered_map(map: &FilteredMap) -> Vec<u8> {
-    let pixels = map.depth.values().len();
-    let mut bytes = Vec::with_capacity(HEADER_BYTES + FUNNEL_BYTES + pixels * FILTERED_MAP_PIXEL_BYTES);
-    put_header(&mut bytes, FILTERED_MAP, &map.camera);
-    put_floats(&mut bytes, map.depth.values());
-    bytes.extend_from_slice(map.color.values().as_flattened());
-    bytes.extend_from_slice(map.views.values());
-    bytes.extend_from_slice(map.confidence.values());
-    bytes.extend(map.agreeing.values().iter().flat_map(|bits| bits.to_le_bytes()));
-    bytes.extend(map.owns.values().iter().map(|owns| u8::from(*owns)));
-    put_funnel(&mut bytes, &map.funnel);
-    bytes
-}
-
-/// A filtered map from [`encode_filtered_map`]'s bytes.
-pub fn decode_filtered_map(bytes: &[u8]) -> Result<FilteredMap, BlobError> {
-    let (body, funnel) =
-        bytes.split_last_chunk::<FUNNEL_BYTES>().ok_or(BlobError::Kind { expected: "filtered map" })?;
-    let mut reader = Reader { bytes: body, total: body.len() };
-    let camera = reader.header(FILTERED_MAP, "filtered map", FILTERED_MAP_PIXEL_BYTES)?;
-    let depth = reader.floats(&camera)?;
-    let color = reader.colors(&camera)?;
-    let views = reader.bytes_raster(&camera)?;
-    let confidence = reader.bytes_raster(&camera)?;
-    let (agreeing, _) = reader.take(8 * pixels_of(&camera))?.as_chunks::<8>();
-    let agreeing = raster(&camera, agreeing.iter().map(|bits| u64::from_le_bytes(*bits)).collect());
-    let owns = reader.bytes_raster(&camera)?.map(|owns| *owns != 0);
-    let funnel = Reader { bytes: funnel, total: FUNNEL_BYTES }.funnel()?;
-    Ok(FilteredMap { camera, depth, color, views, confidence, agreeing, owns, funnel })
-}
-
 /// The points of one view as bytes: its funnel, then `vertices` as the PLY file will hold them.
-pub fn encode_points(funnel: &Funnel, vertices: &[u8]) -> Vec<u8> {
+pub fn encode_points(funnel: &Funnel, format: VertexFormat, vertices: &[u8]) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(POINTS_HEADER_BYTES + vertices.len());
     bytes.extend_from_slice(&POINTS);
+    bytes.extend([u8::from(format.double), u8::from(format.quality)]);
     put_funnel(&mut bytes, funnel);
     bytes.extend_from_slice(vertices);
     bytes
 }
 
-/// The funnel in [`encode_points`]'s bytes.
-pub fn decode_funnel(bytes: &[u8]) -> Result<Funnel, BlobError> {
+/// What [`encode_points`] made bytes of; the vertices are whole ones.
+pub fn decode_points(bytes: &[u8]) -> Result<(Funnel, VertexFormat, &[u8]), BlobError> {
     let mut reader = Reader { bytes, total: bytes.len() };
     if reader.array()? != POINTS {
         return Err(BlobError::Kind { expected: "view's points" });
     }
-    reader.funnel()
-}
-
-/// The vertices in the blob of a view's points, as the PLY file holds them; whole ones only.
-pub fn decode_points(bytes: &[u8]) -> Result<&[u8], BlobError> {
-    decode_funnel(bytes)?;
-    let vertices = &bytes[POINTS_HEADER_BYTES..];
-    match vertices.len() % VERTEX_BYTES {
-        0 => Ok(vertices),
+    let [double, quality] = reader.array()?.map(|flag: u8| flag != 0);
+    let format = VertexFormat { double, quality };
+    let funnel = reader.funnel()?;
+    match reader.bytes.len() % format.vertex_bytes() {
+        0 => Ok((funnel, format, reader.bytes)),
         part => Err(BlobError::Length { expected: (bytes.len() - part) as u64, got: bytes.len() as u64 }),
     }
 }
 
 const HEADER_BYTES: usize = 8 + 2 * 4 + (5 + 9 + 3) * 8;
 const FUNNEL_BYTES: usize = 6 * 8;
-const POINTS_HEADER_BYTES: usize = 8 + FUNNEL_BYTES;
+const POINTS_HEADER_BYTES: usize = 8 + 2 + FUNNEL_BYTES;
 const DEPTH_MAP_PIXEL_BYTES: usize = 4 + 4 + 3;
-const FILTERED_MAP_PIXEL_BYTES: usize = 4 + 3 + 1 + 1 + 8 + 1;
 
 fn put_header(bytes: &mut Vec<u8>, magic: [u8; 8], camera: &Camera) {
     let k = &camera.intrinsics;
@@ -236,10 +202,6 @@ impl<'a> Reader<'a> {
         Ok(raster(camera, values.iter().map(|value| f32::from_le_bytes(*value)).collect()))
     }
 
-    fn bytes_raster(&mut self, camera: &Camera) -> Result<Raster<u8>, BlobError> {
-        Ok(raster(camera, self.take(pixels_of(camera))?.to_vec()))
-    }
-
     fn colors(&mut self, camera: &Camera) -> Result<Raster<[u8; 3]>, BlobError> {
         let (values, _) = self.take(3 * pixels_of(camera))?.as_chunks::<3>();
         Ok(raster(camera, values.to_vec()))
@@ -271,48 +233,31 @@ mod tests {
         .expect("sizes agree")
     }
 
-    fn filtered_map() -> FilteredMap {
-        let map = depth_map();
-        FilteredMap {
-            camera: map.camera,
-            depth: map.depth,
-            color: map.color,
-            views: Raster::from_fn(8, 6, |x, _| x as u8),
-            confidence: Raster::from_fn(8, 6, |_, y| y as u8),
-            agreeing: Raster::from_fn(8, 6, |x, y| 1 << (8 * y + x)),
-            owns: Raster::from_fn(8, 6, |x, y| x > y),
-            funnel: Funnel {
-                pixels: 48,
-                with_depth: 47,
-                photometric: 20,
-                visible: 19,
-                geometric: 9,
-                emitted: 3,
-            },
-        }
+    fn funnel() -> Funnel {
+        Funnel { pixels: 48, with_depth: 47, photometric: 20, visible: 19, geometric: 9, emitted: 3 }
     }
 
     #[test]
     fn maps_survive_the_bytes() {
         assert_eq!(decode_depth_map(&encode_depth_map(&depth_map())), Ok(depth_map()));
-        assert_eq!(decode_filtered_map(&encode_filtered_map(&filtered_map())), Ok(filtered_map()));
     }
 
     #[test]
     fn points_keep_their_funnel_and_partial_vertices_are_refused() {
-        let funnel = filtered_map().funnel;
-        let bytes = encode_points(&funnel, &[3; 2 * VERTEX_BYTES]);
-        assert_eq!(decode_funnel(&bytes), Ok(funnel));
-        assert_eq!(decode_points(&bytes), Ok(&[3; 2 * VERTEX_BYTES][..]));
-        assert!(decode_points(&bytes[..bytes.len() - 1]).is_err());
-        assert!(decode_points(&bytes[..9]).is_err());
+        for format in [VertexFormat::default(), VertexFormat { double: true, quality: true }] {
+            let vertices = vec![3; 2 * format.vertex_bytes()];
+            let bytes = encode_points(&funnel(), format, &vertices);
+            assert_eq!(decode_points(&bytes), Ok((funnel(), format, &vertices[..])));
+            assert!(decode_points(&bytes[..bytes.len() - 1]).is_err());
+            assert!(decode_points(&bytes[..9]).is_err());
+        }
     }
 
     #[test]
     fn one_kind_is_not_taken_for_the_other() {
-        let error = decode_depth_map(&encode_filtered_map(&filtered_map()));
-        assert_eq!(error, Err(BlobError::Kind { expected: "depth map" }));
-        assert!(decode_filtered_map(&[]).is_err());
+        let points = encode_points(&funnel(), VertexFormat::default(), &[]);
+        assert_eq!(decode_depth_map(&points), Err(BlobError::Kind { expected: "depth map" }));
+        assert!(decode_points(&encode_depth_map(&depth_map())).is_err());
     }
 
     #[test]
@@ -325,13 +270,11 @@ mod tests {
     proptest! {
         #[test]
         fn truncation_and_damage_never_panic(cut in 0_usize..700, at in 0_usize..700, value: u8) {
-            for mut bytes in [encode_depth_map(&depth_map()), encode_filtered_map(&filtered_map())] {
-                let at = at % bytes.len();
-                bytes[at] = value;
-                bytes.truncate(bytes.len() - cut.min(bytes.len()));
-                let (one, other) = (decode_depth_map(&bytes), decode_filtered_map(&bytes));
-                prop_assert!(cut == 0 || (one.is_err() && other.is_err()));
-            }
+            let mut bytes = encode_depth_map(&depth_map());
+            let at = at % bytes.len();
+            bytes[at] = value;
+            bytes.truncate(bytes.len() - cut.min(bytes.len()));
+            prop_assert!(cut == 0 || decode_depth_map(&bytes).is_err());
         }
     }
 }

@@ -110,7 +110,12 @@ mod tests {
         Grant {
             job: JobId([job; 32]),
             attempt: Attempt(1),
-            spec: JobSpec::Emit(EmitSpec { view: ViewId(0), neighbours: vec![], max_relative_depth: 0.01 }),
+            spec: JobSpec::Emit(EmitSpec {
+                view: ViewId(0),
+                neighbours: vec![],
+                max_relative_depth: 0.01,
+                double: false,
+            }),
             inputs: vec![],
         }
     }

@@ -5,7 +5,10 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use bytes::Bytes;
-use planesweep_fusion::{FilteredMap, Funnel, emit, emitted, encode, filter};
+use planesweep_fusion::{
+    FilteredMap, Funnel, VertexFormat, decode_filtered_map, emit, emitted, encode, encode_filtered_map,
+    filter,
+};
 use planesweep_plan::{BlobKey, EmitSpec, FilterSpec, InferSpec, JobId, JobSpec};
 use planesweep_proto::{Grant, Input, Success};
 use planesweep_scene::DepthMap;
@@ -15,9 +18,7 @@ use tokio::sync::Semaphore;
 use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
-use crate::blob::{
-    decode_depth_map, decode_filtered_map, encode_depth_map, encode_filtered_map, encode_points,
-};
+use crate::blob::{decode_depth_map, encode_depth_map, encode_points};
 use crate::cache::cache;
 use crate::cloud::assemble;
 use crate::device::{Device, InferRequest};
@@ -193,14 +194,15 @@ impl Jobs {
         let map = maps.next().flatten().ok_or(JobError::NoDepthMap)?;
         let others: Vec<Arc<FilteredMap>> = maps.flatten().collect();
         let max_relative_depth = spec.max_relative_depth;
+        let format = VertexFormat { double: spec.double, quality: false };
         let (funnel, vertices) = compute(move || {
             let others: Vec<&FilteredMap> = others.iter().map(AsRef::as_ref).collect();
             let points = emit(&map, &emitted(&map, &others, max_relative_depth));
-            (Funnel { emitted: points.len() as u64, ..map.funnel }, encode(&points))
+            (Funnel { emitted: points.len() as u64, ..map.funnel }, encode(&points, format))
         })
         .await;
         let measurements = BTreeMap::from([("points".to_owned(), funnel.emitted as f64)]);
-        Ok((encode_points(&funnel, &vertices), measurements))
+        Ok((encode_points(&funnel, format, &vertices), measurements))
     }
 
     async fn assemble(&self, inputs: &[Input]) -> Result<Made, JobError> {
@@ -242,7 +244,7 @@ impl Jobs {
         let read = async {
             let bytes = self.input(input).await?.unwrap_or_default();
             let map = decode_filtered_map(&bytes)
-                .map_err(|source| JobError::Malformed { job: input.job, source })?;
+                .map_err(|source| JobError::Malformed { job: input.job, source: source.into() })?;
             Ok(Arc::new(map))
         };
         self.filtered.get_or_insert_async(&produced.blob, read).await.map(Some)

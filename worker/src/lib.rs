@@ -25,6 +25,6 @@ mod jobs;
 mod store;
 
 pub use agent::{WorkerConfig, WorkerError, run_worker};
-pub use blob::{BlobError, decode_depth_map, decode_filtered_map};
+pub use blob::{BlobError, decode_depth_map};
 pub use device::BackendFactory;
 pub use store::{Store, StoreError};

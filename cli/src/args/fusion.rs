@@ -12,19 +12,19 @@ pub struct FilterArgs {
     /// What decides whether a depth is kept.
     #[arg(long, value_enum, default_value = "consistency")]
     pub fusion: FusionArg,
-    /// Drop pixels with less confidence.
-    #[arg(long, default_value_t = 0.8, value_parser = share)]
-    pub min_confidence: f32,
+    /// Drop pixels with less confidence [default: 0.8].
+    #[arg(long, value_parser = share)]
+    pub min_confidence: Option<f32>,
     /// Views that must agree on a depth, the reference included. The paper says three; scripts that
-    /// ask for three source views mean 4 here. With dynamic consistency, the fewest that may agree.
-    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=255))]
-    pub min_views: u32,
-    /// Largest reprojection error, in pixels of the depth map.
-    #[arg(long, default_value_t = 1.0, value_parser = positive)]
-    pub max_reprojection: f32,
-    /// Largest relative difference of depths.
-    #[arg(long, default_value_t = 0.01, value_parser = positive)]
-    pub max_depth_difference: f32,
+    /// ask for three source views mean 4 here. With dynamic consistency, the fewest that may agree [default: 3].
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=255))]
+    pub min_views: Option<u32>,
+    /// Largest reprojection error, in pixels of the depth map [default: 1].
+    #[arg(long, value_parser = positive)]
+    pub max_reprojection: Option<f32>,
+    /// Largest relative difference of depths [default: 0.01].
+    #[arg(long, value_parser = positive)]
+    pub max_depth_difference: Option<f32>,
     /// Read a neighbour's depth between its pixels only where these are valid and continuous, instead
     /// of plainly bilinear as the common scripts do.
     #[arg(long)]
@@ -65,13 +65,18 @@ impl From<FusionArg> for FusionMethod {
 impl FilterArgs {
     /// As fusion wants it.
     pub fn options(&self) -> FilterOptions {
+        self.options_over(FilterOptions { method: self.fusion.into(), ..FilterOptions::default() })
+    }
+
+    /// What was given, over these defaults.
+    pub fn options_over(&self, defaults: FilterOptions) -> FilterOptions {
         FilterOptions {
-            method: self.fusion.into(),
-            min_confidence: self.min_confidence,
-            min_views: self.min_views,
-            max_reprojection_px: self.max_reprojection,
-            max_relative_depth: self.max_depth_difference,
-            sampling: if self.continuous { DepthSampling::Continuous } else { DepthSampling::Bilinear },
+            method: defaults.method,
+            min_confidence: self.min_confidence.unwrap_or(defaults.min_confidence),
+            min_views: self.min_views.unwrap_or(defaults.min_views),
+            max_reprojection_px: self.max_reprojection.unwrap_or(defaults.max_reprojection_px),
+            max_relative_depth: self.max_depth_difference.unwrap_or(defaults.max_relative_depth),
+            sampling: if self.continuous { DepthSampling::Continuous } else { defaults.sampling },
         }
     }
 }

@@ -16,6 +16,7 @@ use crate::commands::convert::ConvertArgs;
 use crate::commands::benchmark::BenchmarkArgs;
 use crate::commands::depth::DepthArgs;
 use crate::commands::evaluate::EvaluateCommand;
+use crate::commands::fuse::FuseArgs;
 use crate::commands::inspect::InspectArgs;
 use crate::commands::reconstruct::ReconstructArgs;
 use crate::commands::render_depth::RenderDepthArgs;
@@ -55,6 +56,8 @@ pub enum Command {
     Convert(ConvertArgs),
     /// Infer the depth map of one view in this process.
     Depth(DepthArgs),
+    /// Fuse depth maps, of this program or any MVS network, into a point cloud.
+    Fuse(FuseArgs),
     /// Make a scene with exact ground truth, or training samples.
     Synth(SynthArgs),
     /// Train weights from scratch on generated scenes; the same command again resumes.

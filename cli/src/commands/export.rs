@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
 use bytes::Bytes;
-use planesweep_fusion::VERTEX_BYTES;
+use planesweep_fusion::{VertexFormat, decode_filtered_map};
 use planesweep_plan::{BlobKey, Job, JobId, NUMERICS_VERSION, ViewPlan, sparse_depths};
 use planesweep_proto::{CODE_VERSION, JobResult, JobState};
 use planesweep_report::{
@@ -15,7 +15,7 @@ use planesweep_report::{
 use planesweep_scene::{
     Camera, Raster, Scene, SourceScore, ViewId, mvsnet_cam_text, mvsnet_pair_text, write_atomically,
 };
-use planesweep_worker::{Store, decode_depth_map, decode_filtered_map};
+use planesweep_worker::{Store, decode_depth_map};
 use rayon::prelude::*;
 use serde_json::json;
 use tokio::runtime::Runtime;
@@ -249,14 +249,22 @@ fn write_cloud(run: &Finished<'_>, out: &OutFolder) -> Result<(BlobKey, Bytes)> 
 }
 
 /// Position and colour of every point of a cloud that a worker assembled.
-fn vertices(cloud: &[u8]) -> impl Iterator<Item = ([f32; 3], [u8; 3])> {
+fn vertices(cloud: &[u8]) -> impl Iterator<Item = ([f64; 3], [u8; 3])> {
     const END: &[u8] = b"end_header\n";
     let header =
         cloud.windows(END.len()).position(|window| window == END).map_or(cloud.len(), |at| at + END.len());
-    let (vertices, _) = cloud[header..].as_chunks::<VERTEX_BYTES>();
-    vertices.iter().map(|v| {
-        let float = |at: usize| f32::from_le_bytes([v[at], v[at + 1], v[at + 2], v[at + 3]]);
-        ([float(0), float(4), float(8)], [v[24], v[25], v[26]])
+    let double = String::from_utf8_lossy(&cloud[..header]).contains("property double x");
+    let format = VertexFormat { double, quality: false };
+    let (position, color) = if double { (8, 36) } else { (4, 24) };
+    cloud[header..].chunks_exact(format.vertex_bytes()).map(move |v| {
+        let number = |axis: usize| {
+            let bytes = &v[axis * position..][..position];
+            match bytes.try_into() {
+                Ok(bytes) => f64::from_le_bytes(bytes),
+                Err(_) => bytes.try_into().map_or(0.0, f32::from_le_bytes).into(),
+            }
+        };
+        ([number(0), number(1), number(2)], [v[color], v[color + 1], v[color + 2]])
     })
 }
 

@@ -6,6 +6,7 @@ pub mod benchmark;
 pub mod depth;
 pub mod evaluate;
 mod export;
+pub mod fuse;
 pub mod inspect;
 pub mod reconstruct;
 pub mod render_depth;

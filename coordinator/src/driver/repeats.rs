@@ -64,7 +64,12 @@ mod tests {
 
     fn emit(view: u32, neighbours: &[u32], need: u8) -> Job {
         let neighbours = neighbours.iter().copied().map(ViewId).collect();
-        let spec = JobSpec::Emit(EmitSpec { view: ViewId(view), neighbours, max_relative_depth: 0.01 });
+        let spec = JobSpec::Emit(EmitSpec {
+            view: ViewId(view),
+            neighbours,
+            max_relative_depth: 0.01,
+            double: false,
+        });
         Job { id: JobId([1; 32]), spec, needs: vec![JobId([need; 32])] }
     }
 

@@ -61,8 +61,12 @@ pub(crate) fn plan(views: u32) -> Vec<Job> {
         jobs.push(Job { id: id("filter", view), spec: JobSpec::Filter(spec), needs: pair("infer", view) });
     }
     for view in 0..views {
-        let spec =
-            EmitSpec { view: ViewId(view), neighbours: vec![ViewId(next(view))], max_relative_depth: 0.01 };
+        let spec = EmitSpec {
+            view: ViewId(view),
+            neighbours: vec![ViewId(next(view))],
+            max_relative_depth: 0.01,
+            double: false,
+        };
         jobs.push(Job { id: id("emit", view), spec: JobSpec::Emit(spec), needs: pair("filter", view) });
     }
     let spec = JobSpec::Assemble(AssembleSpec { views: (0..views).map(ViewId).collect() });

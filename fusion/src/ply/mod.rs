@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use thiserror::Error;
 
 pub use read::read_ply;
-pub use write::{PlyWriter, VERTEX_BYTES, encode, ply_header};
+pub use write::{PlyWriter, VertexFormat, encode, ply_header};
 
 /// Why a PLY file could not be written or read.
 #[derive(Debug, Error)]
@@ -31,16 +31,6 @@ pub enum PlyError {
         /// What the system said.
         #[source]
         source: io::Error,
-    },
-    /// The header promised another number of vertices.
-    #[error("cannot finish {}: {written} vertices written, {announced} announced", path.display())]
-    Count {
-        /// The file to be written.
-        path: PathBuf,
-        /// Vertices in the header.
-        announced: u64,
-        /// Whole vertices written.
-        written: u64,
     },
     /// The file cannot be opened or read.
     #[error("cannot read {}", path.display())]

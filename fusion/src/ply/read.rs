@@ -376,14 +376,14 @@ mod tests {
     }
 
     #[test]
-    fn colmaps_own_cloud_is_read_and_written_to_the_same_bytes() {
+    fn colmaps_own_cloud_is_read_and_written_to_the_same_vertices() {
         let path = Path::new(concat!(
             env!("CARGO_MANIFEST_DIR"),
             "/../../shared/data/colmap/testColmap/dense/fused.ply"
         ));
         if !path.exists() {
             eprintln!(
-                "SKIPPED colmaps_own_cloud_is_read_and_written_to_the_same_bytes: {} is not there",
+                "SKIPPED colmaps_own_cloud_is_read_and_written_to_the_same_vertices: {} is not there",
                 path.display()
             );
             return;
@@ -395,10 +395,15 @@ mod tests {
         assert_eq!(points[8].color, [141, 112, 108]);
         let folder = tempfile::tempdir().expect("a folder");
         let copy = folder.path().join("copy.ply");
-        let mut writer = super::super::PlyWriter::create(&copy, 11).expect("created");
+        let mut writer =
+            super::super::PlyWriter::create(&copy, super::super::VertexFormat::default()).expect("created");
         writer.write(&points).expect("written");
         writer.finish().expect("finished");
-        assert_eq!(fs::read(copy).expect("read"), fs::read(path).expect("read"));
+        let vertices = |path: &Path| {
+            let bytes = fs::read(path).expect("read");
+            bytes[bytes.len() - 11 * 27..].to_vec()
+        };
+        assert_eq!(vertices(&copy), vertices(path));
     }
 
     proptest! {

@@ -1,31 +1,61 @@
 //! A streaming writer of binary PLY files in the layout of COLMAP's `fused.ply`.
 
-use std::fs::Permissions;
-use std::io::{BufWriter, Write};
-use std::os::unix::fs::PermissionsExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use tempfile::NamedTempFile;
+use planesweep_scene::Camera;
 
 use super::PlyError;
 use crate::cloud::Point;
+use crate::output::Output;
 
-/// Bytes of a vertex: six floats (position, normal) and three unsigned characters (RGB).
-pub const VERTEX_BYTES: usize = 27;
+/// What a file holds of each point; the default is what COLMAP writes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct VertexFormat {
+    /// Positions as doubles: floats keep seven digits only, which georeferenced coordinates use up.
+    pub double: bool,
+    /// Confidence (float, 0 to 1) and number of views (uchar) of each point, after its colour.
+    pub quality: bool,
+}
 
-/// The points as the file holds them, little-endian and one after the other: [`VERTEX_BYTES`] each.
-///
-/// Positions are rounded to `f32`, as everywhere in this format.
-pub fn encode(points: &[Point]) -> Vec<u8> {
-    let mut bytes = Vec::with_capacity(points.len() * VERTEX_BYTES);
+impl VertexFormat {
+    /// Whether positions in floats would lose more than a quarter of a pixel of `camera` at
+    /// `nearest_depth` (scene units); when that is not known, whether coordinates reach a hundred
+    /// thousand.
+    pub fn needs_doubles(camera: &Camera, nearest_depth: Option<f64>) -> bool {
+        let reach = camera.pose.centre().coords.amax();
+        match nearest_depth {
+            // A float is off by up to 2^-25 of the value.
+            Some(depth) => reach * 0.5_f64.powi(25) > 0.25 * depth / camera.intrinsics.fx,
+            None => reach > 1e5,
+        }
+    }
+
+    /// Bytes of a vertex.
+    pub fn vertex_bytes(self) -> usize {
+        let position = if self.double { 8 } else { 4 };
+        3 * position + 3 * 4 + 3 + if self.quality { 5 } else { 0 }
+    }
+}
+
+/// The points as the file holds them, little-endian and one after the other.
+pub fn encode(points: &[Point], format: VertexFormat) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(points.len() * format.vertex_bytes());
     for point in points {
         for value in point.position {
-            bytes.extend_from_slice(&(value as f32).to_le_bytes());
+            if format.double {
+                bytes.extend_from_slice(&value.to_le_bytes());
+            } else {
+                bytes.extend_from_slice(&(value as f32).to_le_bytes());
+            }
         }
         for value in point.normal {
             bytes.extend_from_slice(&value.to_le_bytes());
         }
         bytes.extend_from_slice(&point.color);
+        if format.quality {
+            bytes.extend_from_slice(&point.confidence.to_le_bytes());
+            bytes.push(point.views);
+        }
     }
     bytes
 }
@@ -34,76 +64,62 @@ pub fn encode(points: &[Point]) -> Vec<u8> {
 /// whole, and never otherwise.
 #[derive(Debug)]
 pub struct PlyWriter {
-    path: PathBuf,
-    file: BufWriter<NamedTempFile>,
-    announced: u64,
-    written_bytes: u64,
+    output: Output,
+    format: VertexFormat,
+    vertices: u64,
 }
 
 impl PlyWriter {
-    /// Begins a cloud of `vertices` points that will stand at `path`. Its folder must exist: the
-    /// temporary file lies beside it until then.
-    pub fn create(path: &Path, vertices: u64) -> Result<Self, PlyError> {
-        let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let file = tempfile::Builder::new()
-            .prefix(".cloud-")
-            .suffix(".ply.tmp")
-            .permissions(Permissions::from_mode(0o666)) // less the umask, as for any other file
-            .tempfile_in(folder)
-            .map_err(|source| PlyError::Create { path: path.to_path_buf(), source })?;
-        let mut writer = Self {
-            path: path.to_path_buf(),
-            file: BufWriter::with_capacity(1 << 20, file),
-            announced: vertices,
-            written_bytes: 0,
-        };
-        writer.write_all(ply_header(vertices).as_bytes())?;
+    /// Begins a cloud that will stand at `path`. Its folder must exist: the temporary file lies beside
+    /// it until then.
+    pub fn create(path: &Path, format: VertexFormat) -> Result<Self, PlyError> {
+        let output =
+            Output::create(path).map_err(|source| PlyError::Create { path: path.to_path_buf(), source })?;
+        let mut writer = Self { output, format, vertices: 0 };
+        writer.write_all(ply_header(0, format).as_bytes())?;
         Ok(writer)
     }
 
     /// Appends points.
     pub fn write(&mut self, points: &[Point]) -> Result<(), PlyError> {
-        points.chunks(1 << 16).try_for_each(|chunk| self.write_encoded(&encode(chunk)))
+        self.vertices += points.len() as u64;
+        points.chunks(1 << 16).try_for_each(|chunk| self.write_all(&encode(chunk, self.format)))
     }
 
-    /// Appends points that [`encode`] made bytes of.
-    pub fn write_encoded(&mut self, vertices: &[u8]) -> Result<(), PlyError> {
-        self.written_bytes += vertices.len() as u64;
-        self.write_all(vertices)
-    }
-
-    /// Flushes the file to disk and gives it its name, replacing what was there; refused when not
-    /// exactly the announced number of vertices was written.
-    pub fn finish(self) -> Result<(), PlyError> {
-        let Self { path, file, announced, written_bytes } = self;
-        if announced.checked_mul(VERTEX_BYTES as u64) != Some(written_bytes) {
-            let written = written_bytes / VERTEX_BYTES as u64;
-            return Err(PlyError::Count { path, announced, written });
-        }
-        let placed = (|| {
-            let file = file.into_inner().map_err(std::io::IntoInnerError::into_error)?;
-            file.as_file().sync_all()?;
-            file.persist(&path)?;
-            Ok(())
-        })();
-        placed.map_err(|source| PlyError::Write { path, source })
+    /// Flushes the file to disk and gives it its name, replacing what was there; returns how many
+    /// points it has.
+    pub fn finish(self) -> Result<u64, PlyError> {
+        let path = self.output.path().to_path_buf();
+        let head = ply_header(self.vertices, self.format);
+        self.output.finish(head.as_bytes()).map_err(|source| PlyError::Write { path, source })?;
+        Ok(self.vertices)
     }
 
     fn write_all(&mut self, bytes: &[u8]) -> Result<(), PlyError> {
-        let written = self.file.write_all(bytes);
-        written.map_err(|source| PlyError::Write { path: self.path.clone(), source })
+        let written = self.output.write(bytes);
+        written.map_err(|source| PlyError::Write { path: self.output.path().to_path_buf(), source })
     }
 }
 
-/// The header of a file of `vertices` points in the layout of [`encode`].
-pub fn ply_header(vertices: u64) -> String {
-    let properties: String = ["x", "y", "z", "nx", "ny", "nz"]
-        .map(|name| ("float", name))
-        .into_iter()
-        .chain(["red", "green", "blue"].map(|name| ("uchar", name)))
-        .map(|(scalar, name)| ["property ", scalar, " ", name, "\n"].concat())
-        .collect();
-    format!("ply\nformat binary_little_endian 1.0\nelement vertex {vertices}\n{properties}end_header\n")
+/// The header of a file of `vertices` points in the layout of [`encode`]. Its length does not depend on
+/// their number.
+pub fn ply_header(vertices: u64, format: VertexFormat) -> String {
+    let position = if format.double { "double" } else { "float" };
+    let mut properties: Vec<(&str, &str)> = ["x", "y", "z"].map(|name| (position, name)).into();
+    properties.extend(["nx", "ny", "nz"].map(|name| ("float", name)));
+    properties.extend(["red", "green", "blue"].map(|name| ("uchar", name)));
+    if format.quality {
+        properties.extend([("float", "confidence"), ("uchar", "views")]);
+    }
+    let lines: Vec<String> =
+        properties.iter().map(|(scalar, name)| ["property ", scalar, " ", name, "\n"].concat()).collect();
+    let properties = lines.concat();
+    let count = vertices.to_string();
+    // The count is written when it is known, so room is kept for the longest.
+    let room = ".".repeat(20 - count.len());
+    format!(
+        "ply\nformat binary_little_endian 1.0\ncomment planesweep{room}\nelement vertex {count}\n{properties}end_header\n"
+    )
 }
 
 #[cfg(test)]
@@ -129,41 +145,75 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("cloud.ply");
         let points = points(70_000);
-        let mut writer = PlyWriter::create(&path, 70_000).expect("created");
+        let mut writer = PlyWriter::create(&path, VertexFormat::default()).expect("created");
         writer.write(&points[..69_000]).expect("written");
-        writer.write_encoded(&encode(&points[69_000..])).expect("written");
+        writer.write(&points[69_000..]).expect("written");
         assert!(!path.exists(), "nothing stands under the name before the end");
-        writer.finish().expect("finished");
+        assert_eq!(writer.finish().expect("finished"), 70_000);
         assert_eq!(read_ply(&path).expect("read"), points);
         let bytes = fs::read(&path).expect("read");
-        assert_eq!(bytes.len() as u64, ply_header(70_000).len() as u64 + 70_000 * 27);
+        assert_eq!(bytes.len(), ply_header(0, VertexFormat::default()).len() + 70_000 * 27);
         assert_eq!(fs::read_dir(folder.path()).expect("listed").count(), 1);
     }
 
     #[test]
-    fn a_wrong_count_leaves_the_old_file() {
+    fn doubles_keep_what_floats_lose() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("cloud.ply");
+        let position = [4_412_345.678_9, 5_312_345.012_3, 412.5];
+        let point = Point { position, confidence: 0.75, views: 7, ..Point::default() };
+        for (double, quality, bytes) in [(false, false, 27), (true, false, 39), (true, true, 44)] {
+            let format = VertexFormat { double, quality };
+            assert_eq!((format.vertex_bytes(), encode(&[point], format).len()), (bytes, bytes));
+            let mut writer = PlyWriter::create(&path, format).expect("created");
+            writer.write(&[point]).expect("written");
+            writer.finish().expect("finished");
+            let read = read_ply(&path).expect("read")[0].position;
+            assert_eq!(read == position, double, "{read:?}");
+        }
+        let encoded = encode(&[point], VertexFormat { double: true, quality: true });
+        assert_eq!(encoded[39..], [&0.75_f32.to_le_bytes()[..], &[7]].concat());
+    }
+
+    #[test]
+    fn doubles_are_needed_far_from_the_origin() {
+        let mut camera = crate::analytic::camera_at(0.0, 0.0, 1000, 800);
+        assert!(!VertexFormat::needs_doubles(&camera, Some(1.0)));
+        assert!(!VertexFormat::needs_doubles(&camera, None));
+        camera.pose.translation.x = 4e5;
+        assert!(
+            VertexFormat::needs_doubles(&camera, Some(1.0)) && VertexFormat::needs_doubles(&camera, None)
+        );
+        assert!(!VertexFormat::needs_doubles(&camera, Some(500.0)), "what is far need not be so exact");
+    }
+
+    #[test]
+    fn a_file_that_is_not_finished_leaves_the_old_one() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("cloud.ply");
         fs::write(&path, "old").expect("written");
-        for count in [2, 4] {
-            let mut writer = PlyWriter::create(&path, 3).expect("created");
-            writer.write(&points(count)).expect("written");
-            let error = writer.finish().expect_err("another count");
-            assert!(
-                matches!(error, PlyError::Count { announced: 3, written, .. } if written == count as u64)
-            );
-        }
-        let mut writer = PlyWriter::create(&path, 3).expect("created");
-        writer.write_encoded(&[0; 3 * VERTEX_BYTES + 1]).expect("written");
-        writer.finish().expect_err("a part of a vertex too many");
+        let mut writer = PlyWriter::create(&path, VertexFormat::default()).expect("created");
+        writer.write(&points(3)).expect("written");
+        drop(writer);
         assert_eq!(fs::read_to_string(&path).expect("read"), "old");
         assert_eq!(fs::read_dir(folder.path()).expect("listed").count(), 1);
     }
 
     #[test]
+    fn headers_are_of_one_length() {
+        for format in [VertexFormat::default(), VertexFormat { double: true, quality: true }] {
+            let length = ply_header(0, format).len();
+            for vertices in [9, 10, 123_456_789, u64::MAX] {
+                assert_eq!(ply_header(vertices, format).len(), length);
+            }
+        }
+    }
+
+    #[test]
     fn a_missing_folder_is_named() {
         let folder = tempfile::tempdir().expect("a folder");
-        let error = PlyWriter::create(&folder.path().join("no/cloud.ply"), 1).expect_err("no folder");
+        let error = PlyWriter::create(&folder.path().join("no/cloud.ply"), VertexFormat::default())
+            .expect_err("no folder");
         assert!(error.to_string().ends_with("no/cloud.ply"), "{error}");
     }
 }

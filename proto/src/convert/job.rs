@@ -75,6 +75,7 @@ impl From<&JobSpec> for wire::JobSpec {
                     view: spec.view.0,
                     neighbours: numbers(&spec.neighbours),
                     max_relative_depth: spec.max_relative_depth,
+                    double: spec.double,
                 }),
                 JobSpec::Assemble(spec) => Spec::Assemble(wire::AssembleSpec { views: numbers(&spec.views) }),
             }),
@@ -99,6 +100,7 @@ impl TryFrom<wire::JobSpec> for JobSpec {
                 view: ViewId(spec.view),
                 neighbours: views("neighbours", spec.neighbours)?,
                 max_relative_depth: threshold("max_relative_depth", spec.max_relative_depth)?,
+                double: spec.double,
             }),
             Spec::Assemble(spec) => Self::Assemble(AssembleSpec { views: views("views", spec.views)? }),
         })
@@ -488,9 +490,11 @@ mod tests {
             infer().prop_map(JobSpec::Infer),
             any::<u32>().prop_map(|view| JobSpec::Stitch(StitchSpec { view: ViewId(view) })),
             filter().prop_map(JobSpec::Filter),
-            (any::<u32>(), view_list(), 0.0..1.0_f32).prop_map(|(view, neighbours, max_relative_depth)| {
-                JobSpec::Emit(EmitSpec { view: ViewId(view), neighbours, max_relative_depth })
-            }),
+            (any::<u32>(), view_list(), 0.0..1.0_f32, any::<bool>()).prop_map(
+                |(view, neighbours, max_relative_depth, double)| {
+                    JobSpec::Emit(EmitSpec { view: ViewId(view), neighbours, max_relative_depth, double })
+                },
+            ),
             view_list().prop_map(|views| JobSpec::Assemble(AssembleSpec { views })),
         ];
         (any::<[u8; 32]>(), spec, vec(any::<[u8; 32]>(), 0..12)).prop_map(|(id, spec, needs)| Job {

@@ -392,6 +392,7 @@ mod tests {
                     view: ViewId(view),
                     neighbours: vec![ViewId(2)],
                     max_relative_depth: 0.01,
+                    double: false,
                 });
                 Grant { job, attempt, spec, inputs }
             };
