@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use nalgebra::{Point3, Similarity3, Vector3};
-use planesweep_fusion::{PlyWriter, Point};
+use planesweep_fusion::{PlyWriter, Point, VertexFormat};
 use planesweep_scene::Scene;
 
 use crate::scenes::plane;
@@ -74,9 +74,10 @@ fn write_cloud(path: &Path, points: &[Point3<f64>]) {
             color: [128; 3],
             confidence: 0.0,
             views: 0,
+            seen_by: 0,
         })
         .collect();
-    let mut writer = PlyWriter::create(path, points.len() as u64).expect("created");
+    let mut writer = PlyWriter::create(path, VertexFormat::default()).expect("created");
     writer.write(&points).expect("written");
     writer.finish().expect("finished");
 }

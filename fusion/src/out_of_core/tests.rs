@@ -41,6 +41,7 @@ fn run(work: &Work, load: &LoadMap<'_>) -> (Vec<(ViewId, Point)>, Fused, usize) 
     (cloud, fused, loads.into_inner())
 }
 
+#[expect(clippy::unnecessary_wraps, reason = "it stands for a loader")]
 fn good(view: ViewId) -> Result<DepthMap, LoadError> {
     Ok(map(view))
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use nalgebra::Point3;
-use planesweep_fusion::{PlyWriter, Point};
+use planesweep_fusion::{PlyWriter, Point, VertexFormat};
 use planesweep_report::{LinePlot, draw_lines, encode_png, error_color};
 use planesweep_scene::write_atomically;
 use serde_json::Value;
@@ -29,7 +29,8 @@ impl Figures {
 
     /// Writes `NAME.ply`: points coloured by their distance, from white at none to dark red at `limit`.
     pub fn cloud(&self, name: &str, points: &[(Point3<f64>, f64)], limit: f64) -> Result<()> {
-        let mut writer = PlyWriter::create(&self.folder.join(format!("{name}.ply")), points.len() as u64)?;
+        let mut writer =
+            PlyWriter::create(&self.folder.join(format!("{name}.ply")), VertexFormat::default())?;
         for chunk in points.chunks(1 << 16) {
             let colored: Vec<Point> = chunk
                 .iter()
@@ -39,11 +40,13 @@ impl Figures {
                     color: error_color((distance / limit) as f32),
                     confidence: 0.0,
                     views: 0,
+                    seen_by: 0,
                 })
                 .collect();
             writer.write(&colored)?;
         }
-        Ok(writer.finish()?)
+        writer.finish()?;
+        Ok(())
     }
 
     /// The outline of a histogram of distances from 0 to `end` in bars `width` wide: shares of all
