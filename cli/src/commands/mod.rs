@@ -1,8 +1,8 @@
 //! One file per command.
 
 pub mod bench;
-pub mod convert;
 pub mod benchmark;
+pub mod convert;
 pub mod depth;
 pub mod evaluate;
 mod export;
