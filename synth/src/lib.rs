@@ -3,6 +3,9 @@
 //! A [`SynthScene`] follows from a seed: bodies with procedural textures, a sun, cameras around
 //! them. It renders images with exact depth from any camera, and samples sparse points with tracks
 //! as structure from motion would find them. [`write_demo`] writes one as a COLMAP model.
+//!
+//! What the network learns from comes from here, too: [`training_sample`] makes up a scene for every seed,
+//! [`DataSet`] reads folders of training data, and [`write_mesh_depth`] renders such a folder from a mesh.
 
 #![warn(missing_docs)]
 
