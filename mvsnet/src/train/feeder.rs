@@ -98,6 +98,16 @@ struct FeedState {
     closed: bool,
 }
 
+/// Closes a feeder when it is dropped.
+pub(crate) struct Closing<'f, 'a>(&'f Feeder<'a>);
+
+impl Drop for Closing<'_, '_> {
+    fn drop(&mut self) {
+        self.0.lock().closed = true;
+        self.0.changed.notify_all();
+    }
+}
+
 impl<'a> Feeder<'a> {
     /// Begins with the example of number `first`.
     pub(crate) fn new(source: &'a dyn SampleSource, config: &'a TrainConfig, first: u64) -> Self {
@@ -145,13 +155,42 @@ impl<'a> Feeder<'a> {
         self.lock().ready.len()
     }
 
-    /// Lets the threads end.
-    pub(crate) fn close(&self) {
-        self.lock().closed = true;
-        self.changed.notify_all();
+    /// Lets the threads end when it is dropped.
+    pub(crate) fn closing(&self) -> Closing<'_, 'a> {
+        Closing(self)
     }
 
     fn lock(&self) -> MutexGuard<'_, FeedState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Broken;
+
+    impl SampleSource for Broken {
+        fn sample(&self, seed: u64, shape: &SampleShape) -> Result<TrainingSample, SampleError> {
+            assert!(shape.views < 3, "no scene has three views");
+            Err(SampleError { seed, why: "there are none".to_owned() })
+        }
+    }
+
+    #[test]
+    fn sources_that_fail_or_panic_give_an_error_and_threads_end() {
+        let mut config = TrainConfig::default();
+        for (views, panics) in [(2, false), (3, true)] {
+            config.samples.views = vec![views];
+            let feeder = Feeder::new(&Broken, &config, 7);
+            let error = std::thread::scope(|scope| {
+                scope.spawn(|| feeder.work());
+                let _closing = feeder.closing();
+                feeder.next().expect_err("nothing can be made")
+            });
+            assert_eq!(matches!(error, FeedError::Panicked { number: 7 }), panics, "{error}");
+            assert_eq!(matches!(error, FeedError::Source { number: 7, .. }), !panics, "{error}");
+        }
     }
 }

@@ -152,9 +152,9 @@ impl<'a> Trainer<'a> {
                 let feeder = &feeder;
                 scope.spawn(move || pool.install(|| feeder.work()));
             }
-            let trained = self.steps(&feeder, validation, watch);
-            feeder.close();
-            trained
+            // Its threads end however the steps do, a panic included.
+            let _closing = feeder.closing();
+            self.steps(&feeder, validation, watch)
         })?;
         self.weights(validation)
     }
