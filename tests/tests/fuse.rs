@@ -32,11 +32,13 @@ fn a_result_is_fused_again_to_the_same_bytes() {
     }
     fs::create_dir_all(format!("{folder}/cams")).expect("made");
     fs::copy(format!("{out}/pair.txt"), format!("{folder}/pair.txt")).expect("copied");
-    for id in 0..4 {
+    // COLMAP's ids count from 1, the names of the photographs from 0.
+    for id in 1..=4 {
+        let name = id - 1;
         let copy = |from: String, to: String| assert!(fs::copy(from, to).expect("copied") > 0);
         copy(format!("{out}/cams/{id:08}_cam.txt"), format!("{folder}/cams/{id:08}_cam.txt"));
-        copy(format!("{out}/depth/{id:08}.pfm"), format!("{folder}/depth_est/{id:08}.pfm"));
-        copy(format!("{out}/confidence/{id:08}.pfm"), format!("{folder}/confidence/{id:08}.pfm"));
+        copy(format!("{out}/depth/{name:08}.pfm"), format!("{folder}/depth_est/{id:08}.pfm"));
+        copy(format!("{out}/confidence/{name:08}.pfm"), format!("{folder}/confidence/{id:08}.pfm"));
         let image = image::RgbImage::from_pixel(40, 32, image::Rgb([9, 8, 7]));
         image.save(format!("{folder}/images/{id:08}.png")).expect("saved");
     }

@@ -77,7 +77,9 @@ impl Bounds {
         for axis in 0..3 {
             let (first, last) = if inverse[axis] < 0.0 { (self.max, self.min) } else { (self.min, self.max) };
             let near = (first[axis] - origin[axis]) * inverse[axis];
-            let far = (last[axis] - origin[axis]) * inverse[axis];
+            // Three roundings in each: without room for them a ray through a corner misses all boxes that
+            // share it (Ize, Robust BVH Ray Traversal, 2013).
+            let far = (last[axis] - origin[axis]) * inverse[axis] * (1.0 + 4.0 * f64::EPSILON);
             // Zero times infinity gives NaN, which both comparisons skip: the ray lies in that face.
             min = if near > min { near } else { min };
             max = if far < max { far } else { max };
