@@ -16,9 +16,8 @@ const PACKAGES: [&str; 2] = ["pycolmap==4.2.1", "numpy==2.2.6"];
 
 /// The interpreter of an environment that has COLMAP, or a line that says that the test was skipped.
 fn python(test: &str) -> Option<PathBuf> {
-    let script = scripts().join("python_env.py");
-    let output =
-        Command::new("python3").arg(script).arg("pycolmap").args(PACKAGES).stderr(Stdio::inherit()).output();
+    let script = scripts().join("reference_venv.py");
+    let output = Command::new("python3").arg(script).args(PACKAGES).stderr(Stdio::inherit()).output();
     match output {
         Ok(output) if output.status.success() => {
             Some(PathBuf::from(String::from_utf8(output.stdout).expect("a path").trim()))
