@@ -6,11 +6,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use planesweep_plan::{Job, JobId, RunId};
-use planesweep_proto::limits::MAX_JOBS;
 use planesweep_proto::wire::coordinator_server::CoordinatorServer;
-use planesweep_proto::{
-    JobResult, Order, RunStatus, ServiceError, SubmitHeader, Submitted, WireError, check_job,
-};
+use planesweep_proto::{JobResult, Order, RunStatus, ServiceError, SubmitHeader, Submitted, check_jobs};
 use thiserror::Error;
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
@@ -70,7 +67,7 @@ impl Coordinator {
             store_url: config.store_url.clone(),
         };
         let (driver, driver_task) = Driver::start(ledger.clone(), settings, closed.clone()).await?;
-        let service = Service { driver, ledger };
+        let service = Service { driver, ledger, store_url: config.store_url.clone() };
         let server = InterceptedService::new(service.clone().into_server(), CheckToken(token));
         let (health, health_service) = tonic_health::server::health_reporter();
         health.set_serving::<CoordinatorServer<Service>>().await;
@@ -173,15 +170,20 @@ impl Handle {
         self.driver().tell(Message::SetOrder(Order::Drain)).await
     }
 
+    /// Waits until no worker is left that has something in hand: all have gone, or their leases ended.
+    pub async fn drained(&self) -> Result<(), ServiceError> {
+        while !self.driver().ask(Message::AllStopped).await? {
+            tokio::time::sleep(self.report_interval / 50).await;
+        }
+        Ok(())
+    }
+
     /// Tells the workers to stop, waits a report interval at most until all know it, and closes.
     pub async fn shutdown(self) {
         let driver = self.driver();
         let told = async {
             driver.tell(Message::SetOrder(Order::Stop)).await?;
-            while !driver.ask(Message::AllStopped).await? {
-                tokio::time::sleep(self.report_interval / 50).await;
-            }
-            Ok::<(), ServiceError>(())
+            self.drained().await
         };
         // Who does not hear it in time finds nobody to report to, and ends by its own lease.
         let _ = tokio::time::timeout(self.report_interval, told).await;
@@ -201,19 +203,4 @@ impl Handle {
     fn driver(&self) -> &DriverHandle {
         &self.service.driver
     }
-}
-
-/// What a submission over the wire is refused for while it is decoded.
-fn check_jobs(jobs: &[Job]) -> Result<(), ServiceError> {
-    if jobs.len() > MAX_JOBS {
-        return Err(WireError::TooMany { field: "jobs", got: jobs.len(), limit: MAX_JOBS }.into());
-    }
-    for job in jobs {
-        check_job(job).map_err(|error| {
-            let ServiceError { code, message } = error.into();
-            let of_view = job.spec.view().map(|view| format!(" of view {view}")).unwrap_or_default();
-            ServiceError::new(code, format!("{} job{of_view} is refused: {message}", job.spec.kind()))
-        })?;
-    }
-    Ok(())
 }

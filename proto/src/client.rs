@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use planesweep_plan::{Job, RunId};
+use planesweep_plan::{Job, NUMERICS_VERSION, RunId};
 use prost::Message;
 use tokio_stream::StreamExt;
 use tonic::metadata::{Ascii, MetadataValue};
@@ -12,7 +12,10 @@ use tonic::{Request, Status};
 
 use crate::limits::{MAX_MESSAGE_BYTES, SUBMIT_CHUNK_BYTES};
 use crate::wire::coordinator_client::CoordinatorClient;
-use crate::{Code, JobResult, Report, ReportReply, RunStatus, ServiceError, SubmitHeader, Submitted, wire};
+use crate::{
+    CODE_VERSION, Code, JobResult, PROTOCOL_VERSION, Report, ReportReply, RunStatus, RunSummary,
+    ServiceError, SubmitHeader, Submitted, check_jobs, wire,
+};
 
 /// The metadata key that carries the token.
 pub const TOKEN_HEADER: &str = "authorization";
@@ -83,11 +86,29 @@ impl Client {
     }
 
     /// Submits a plan; each job follows those that it needs. A job that repeats an earlier one, but
-    /// for paths, names and ids of views, is left out.
+    /// for paths, names and ids of views, is left out. The first job that is refused is named by its
+    /// kind and view.
     pub async fn submit(&mut self, header: &SubmitHeader, jobs: Vec<Job>) -> Result<Submitted, ServiceError> {
+        check_jobs(&jobs)?;
         let header = wire::SubmitChunk { header: Some(header.into()), jobs: Vec::new() };
         let chunks = std::iter::once(header).chain(Chunks { jobs: jobs.into_iter() });
         Ok(self.stub.submit(tokio_stream::iter(chunks)).await?.into_inner().try_into()?)
+    }
+
+    /// Where the coordinator's results lie; an error when it is of another version.
+    pub async fn store_url(&mut self) -> Result<String, ServiceError> {
+        let request = wire::DescribeRequest {
+            protocol_version: PROTOCOL_VERSION,
+            code_version: CODE_VERSION.to_owned(),
+            numerics_version: NUMERICS_VERSION,
+        };
+        Ok(self.stub.describe(request).await?.into_inner().store_url)
+    }
+
+    /// The latest runs, newest first.
+    pub async fn runs(&mut self) -> Result<Vec<RunSummary>, ServiceError> {
+        let runs = self.stub.runs(wire::RunsRequest {}).await?.into_inner().runs;
+        Ok(runs.into_iter().map(TryInto::try_into).collect::<Result<_, _>>()?)
     }
 
     /// How far a run is, with the jobs that ended after `after`: 0 at first, then

@@ -26,13 +26,13 @@ mod report;
 mod run;
 
 pub use client::{Client, TOKEN_HEADER, bearer};
-pub use convert::{WireError, check_job, decode_job, encode_job};
+pub use convert::{WireError, check_job, check_jobs, decode_job, encode_job};
 pub use error::{Code, ServiceError};
 pub use report::{
     Failure, FinishedJob, Grant, HeldJob, Input, JobAttempt, Order, Outcome, Produced, Report, ReportReply,
     Role, Slots, Success, WorkerState,
 };
-pub use run::{JobResult, JobState, RunStatus, SubmitHeader, Submitted, WorkerStatus};
+pub use run::{JobResult, JobState, RunStatus, RunSummary, SubmitHeader, Submitted, WorkerStatus};
 
 /// Raised when a message changes its meaning; two sides with different numbers refuse each other.
 pub const PROTOCOL_VERSION: u32 = 1;

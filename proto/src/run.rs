@@ -31,6 +31,30 @@ pub struct Submitted {
     pub reused: u32,
 }
 
+/// A run in the list of all.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RunSummary {
+    /// The run.
+    pub run: RunId,
+    /// Its name.
+    pub name: String,
+    /// Whether it was cancelled.
+    pub cancelled: bool,
+    /// Its jobs.
+    pub jobs: u64,
+    /// Those of them that are done.
+    pub done: u64,
+    /// Those that failed for good.
+    pub failed: u64,
+}
+
+impl RunSummary {
+    /// Whether every job ended, well or not, or the run was cancelled.
+    pub fn is_finished(&self) -> bool {
+        self.cancelled || self.done + self.failed == self.jobs
+    }
+}
+
 /// Where a job stands in the ledger.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum JobState {

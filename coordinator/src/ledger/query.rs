@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use planesweep_plan::{Attempt, BlobKey, JobId, RunId, WorkerId};
-use planesweep_proto::{JobResult, JobState, Produced};
+use planesweep_proto::{JobResult, JobState, Produced, RunSummary};
 use planesweep_scene::ViewId;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqlitePool};
@@ -13,6 +13,8 @@ use crate::schedule::{Class, JobRecord, JobShape, LedgerState};
 
 /// Failures and ended jobs listed in one status.
 const LISTED: i64 = 500;
+/// Runs in the list of all.
+const LISTED_RUNS: i64 = 50;
 
 /// The columns that [`result`] reads; `LEFT JOIN`ed nowhere, so all are of `jobs`.
 macro_rules! select_results {
@@ -40,20 +42,7 @@ impl Ledger {
     pub(crate) async fn run(&self, run: &RunId, after: u64) -> Result<RunRow, LedgerError> {
         let failed = LedgerError::statement("read a run");
         let (number, name, cancelled) = self.find(run).await?;
-        // Over indices alone, in their order: the rows are large, and this is asked every second.
-        let rows = sqlx::query(
-            "SELECT kind, state, COUNT(*) AS jobs FROM jobs CROSS JOIN run_jobs
-             WHERE run_jobs.job = jobs.position AND run = $1 GROUP BY state, kind",
-        )
-        .bind(number)
-        .fetch_all(&self.pool)
-        .await
-        .map_err(&failed)?;
-        let mut counts = BTreeMap::new();
-        for row in rows {
-            let jobs: i64 = get(&row, "jobs")?;
-            counts.insert((get(&row, "kind")?, state(&row)?), jobs as u64);
-        }
+        let counts = self.counts(number).await?;
         let failures = sqlx::query(select_results!(
             "FROM jobs JOIN run_jobs ON jobs.position = run_jobs.job
              WHERE state = 'failed' AND run = $1 ORDER BY seq LIMIT $2"
@@ -73,6 +62,52 @@ impl Ledger {
             failures: failures.iter().map(result).collect::<Result<_, _>>()?,
             recent: recent.iter().map(result).collect::<Result<_, _>>()?,
         })
+    }
+
+    /// Jobs of a run by kind and state.
+    async fn counts(&self, run: i64) -> Result<BTreeMap<(String, JobState), u64>, LedgerError> {
+        // Over indices alone, in their order: the rows are large, and this is asked every second.
+        let rows = sqlx::query(
+            "SELECT kind, state, COUNT(*) AS jobs FROM jobs CROSS JOIN run_jobs
+             WHERE run_jobs.job = jobs.position AND run = $1 GROUP BY state, kind",
+        )
+        .bind(run)
+        .fetch_all(&self.pool)
+        .await
+        .map_err(LedgerError::statement("count the jobs of a run"))?;
+        let mut counts = BTreeMap::new();
+        for row in rows {
+            let jobs: i64 = get(&row, "jobs")?;
+            counts.insert((get(&row, "kind")?, state(&row)?), jobs as u64);
+        }
+        Ok(counts)
+    }
+
+    /// The latest runs, newest first.
+    pub(crate) async fn runs(&self) -> Result<Vec<RunSummary>, LedgerError> {
+        let rows: Vec<(i64, String, String, bool)> =
+            sqlx::query_as("SELECT number, id, name, cancelled FROM runs ORDER BY number DESC LIMIT $1")
+                .bind(LISTED_RUNS)
+                .fetch_all(&self.pool)
+                .await
+                .map_err(LedgerError::statement("list runs"))?;
+        let mut runs = Vec::with_capacity(rows.len());
+        for (number, id, name, cancelled) in rows {
+            let counts = self.counts(number).await?;
+            let of = |wanted: Option<JobState>| {
+                let counted = counts.iter().filter(|((_, state), _)| wanted.is_none_or(|w| w == *state));
+                counted.map(|(_, jobs)| jobs).sum()
+            };
+            runs.push(RunSummary {
+                run: RunId(id),
+                name,
+                cancelled,
+                jobs: of(None),
+                done: of(Some(JobState::Done)),
+                failed: of(Some(JobState::Failed)),
+            });
+        }
+        Ok(runs)
     }
 
     /// Up to `limit` jobs of a run in plan order, from place `from` on.

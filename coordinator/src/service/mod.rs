@@ -7,9 +7,10 @@ mod runs;
 use std::pin::Pin;
 use std::sync::Arc;
 
+use planesweep_plan::NUMERICS_VERSION;
 use planesweep_proto::limits::MAX_MESSAGE_BYTES;
 use planesweep_proto::wire::coordinator_server::{Coordinator, CoordinatorServer};
-use planesweep_proto::{Code, PROTOCOL_VERSION, ServiceError, wire};
+use planesweep_proto::{CODE_VERSION, Code, PROTOCOL_VERSION, ServiceError, wire};
 use tokio_stream::Stream;
 use tonic::{Request, Response, Status, Streaming};
 
@@ -23,6 +24,7 @@ use crate::ledger::{Ledger, LedgerError};
 pub(crate) struct Service {
     pub driver: DriverHandle,
     pub ledger: Arc<Ledger>,
+    pub store_url: String,
 }
 
 impl Service {
@@ -71,6 +73,17 @@ impl Coordinator for Service {
     ) -> Result<Response<wire::CancelReply>, Status> {
         Ok(Response::new(self.answer_cancel(request.into_inner()).await?))
     }
+
+    async fn describe(
+        &self,
+        request: Request<wire::DescribeRequest>,
+    ) -> Result<Response<wire::DescribeReply>, Status> {
+        Ok(Response::new(self.answer_describe(&request.into_inner())?))
+    }
+
+    async fn runs(&self, _: Request<wire::RunsRequest>) -> Result<Response<wire::RunsReply>, Status> {
+        Ok(Response::new(self.answer_runs().await?))
+    }
 }
 
 fn check_protocol(version: u32) -> Result<(), ServiceError> {
@@ -78,6 +91,17 @@ fn check_protocol(version: u32) -> Result<(), ServiceError> {
         return Ok(());
     }
     let text = format!("the caller speaks protocol {version}, the coordinator {PROTOCOL_VERSION}");
+    Err(ServiceError::new(Code::VersionMismatch, text))
+}
+
+/// Results of another version must not mix with ours.
+fn check_versions(caller: &str, code: &str, numerics: u32) -> Result<(), ServiceError> {
+    if code == CODE_VERSION && numerics == NUMERICS_VERSION {
+        return Ok(());
+    }
+    let text = format!(
+        "{caller} is version {code} (numerics {numerics}), the coordinator {CODE_VERSION} (numerics {NUMERICS_VERSION})"
+    );
     Err(ServiceError::new(Code::VersionMismatch, text))
 }
 

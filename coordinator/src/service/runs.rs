@@ -1,4 +1,4 @@
-//! `Submit`, `Status`, `Results` and `Cancel`.
+//! `Describe`, `Submit`, `Runs`, `Status`, `Results` and `Cancel`.
 
 use planesweep_plan::{Job, RunId};
 use planesweep_proto::limits::{MAX_JOBS, RESULTS_CHUNK};
@@ -9,13 +9,27 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::codegen::BoxStream;
 use tonic::{Status, Streaming};
 
-use super::{Service, check_protocol, refusal};
+use super::{Service, check_protocol, check_versions, refusal};
 use crate::driver::Message;
 
 /// Chunks of results that wait for a slow reader; the ledger is read no faster.
 const CHUNKS_AHEAD: usize = 2;
 
 impl Service {
+    pub(super) fn answer_describe(
+        &self,
+        request: &wire::DescribeRequest,
+    ) -> Result<wire::DescribeReply, ServiceError> {
+        check_protocol(request.protocol_version)?;
+        check_versions("the caller", &request.code_version, request.numerics_version)?;
+        Ok(wire::DescribeReply { store_url: self.store_url.clone() })
+    }
+
+    pub(super) async fn answer_runs(&self) -> Result<wire::RunsReply, ServiceError> {
+        let runs = self.ledger.runs().await.map_err(|e| refusal(&e))?;
+        Ok(wire::RunsReply { runs: runs.iter().map(Into::into).collect() })
+    }
+
     pub(super) async fn answer_submit(
         &self,
         mut chunks: Streaming<wire::SubmitChunk>,

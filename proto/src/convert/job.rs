@@ -15,9 +15,8 @@ use planesweep_scene::{
 use prost::Message;
 
 use super::check::{at_most, blob_key, each, finite, in_range, job_id, required, short};
-use crate::WireError;
-use crate::limits::{MAX_PATH_BYTES, MAX_PLANES, MAX_SIDE, MAX_SOURCES, MAX_VIEWS};
-use crate::wire;
+use crate::limits::{MAX_JOBS, MAX_PATH_BYTES, MAX_PLANES, MAX_SIDE, MAX_SOURCES, MAX_VIEWS};
+use crate::{ServiceError, WireError, wire};
 
 /// A job as bytes, for the ledger.
 pub fn encode_job(job: &Job) -> Vec<u8> {
@@ -34,6 +33,19 @@ pub fn decode_job(bytes: &[u8]) -> Result<Job, WireError> {
 /// Whether the job would pass if it came over the wire; for jobs that do not.
 pub fn check_job(job: &Job) -> Result<(), WireError> {
     Job::try_from(wire::Job::from(job)).map(drop)
+}
+
+/// Whether all jobs of a submission would pass; the first that does not is named by its kind and view.
+pub fn check_jobs(jobs: &[Job]) -> Result<(), ServiceError> {
+    at_most("jobs", jobs.len(), MAX_JOBS)?;
+    for job in jobs {
+        check_job(job).map_err(|error| {
+            let ServiceError { code, message } = error.into();
+            let of_view = job.spec.view().map(|view| format!(" of view {view}")).unwrap_or_default();
+            ServiceError::new(code, format!("{} job{of_view} is refused: {message}", job.spec.kind()))
+        })?;
+    }
+    Ok(())
 }
 
 impl From<&Job> for wire::Job {

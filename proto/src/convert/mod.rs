@@ -7,4 +7,4 @@ mod report;
 mod run;
 
 pub use check::WireError;
-pub use job::{check_job, decode_job, encode_job};
+pub use job::{check_job, check_jobs, decode_job, encode_job};

@@ -9,7 +9,8 @@ use super::check::{at_most, blob_key, each, job_id, measurements, name, not_nega
 use super::report::{role, worker_state};
 use crate::limits::{MAX_JOBS, MAX_MESSAGE_TEXT_BYTES, MAX_REPORTED};
 use crate::{
-    JobResult, JobState, PROTOCOL_VERSION, RunStatus, SubmitHeader, Submitted, WireError, WorkerStatus, wire,
+    JobResult, JobState, PROTOCOL_VERSION, RunStatus, RunSummary, SubmitHeader, Submitted, WireError,
+    WorkerStatus, wire,
 };
 
 fn job_ids(ids: &[Vec<u8>]) -> Result<Vec<JobId>, WireError> {
@@ -51,6 +52,34 @@ impl TryFrom<wire::SubmitReply> for Submitted {
 
     fn try_from(reply: wire::SubmitReply) -> Result<Self, WireError> {
         Ok(Self { run: RunId(name("run", reply.run)?), jobs: reply.jobs, reused: reply.reused })
+    }
+}
+
+impl From<&RunSummary> for wire::Run {
+    fn from(run: &RunSummary) -> Self {
+        Self {
+            run: run.run.0.clone(),
+            name: run.name.clone(),
+            cancelled: run.cancelled,
+            jobs: run.jobs,
+            done: run.done,
+            failed: run.failed,
+        }
+    }
+}
+
+impl TryFrom<wire::Run> for RunSummary {
+    type Error = WireError;
+
+    fn try_from(run: wire::Run) -> Result<Self, WireError> {
+        Ok(Self {
+            run: RunId(name("run", run.run)?),
+            name: name("run name", run.name)?,
+            cancelled: run.cancelled,
+            jobs: run.jobs,
+            done: run.done,
+            failed: run.failed,
+        })
     }
 }
 
@@ -270,6 +299,20 @@ mod tests {
             divergent_results: 1,
         };
         assert_eq!(RunStatus::try_from(wire::StatusReply::from(&status)), Ok(status));
+    }
+
+    #[test]
+    fn lists_of_runs_survive_the_wire() {
+        let run = RunSummary {
+            run: RunId("castle-7".into()),
+            name: "castle".into(),
+            cancelled: false,
+            jobs: 9,
+            done: 7,
+            failed: 1,
+        };
+        assert!(!run.is_finished() && RunSummary { failed: 2, ..run.clone() }.is_finished());
+        assert_eq!(RunSummary::try_from(wire::Run::from(&run)), Ok(run));
     }
 
     #[test]
