@@ -5,12 +5,15 @@
 
 mod args;
 mod commands;
+mod computation;
 mod console;
 mod depth_maps;
 mod forecast;
 mod input;
+mod interrupts;
 mod network;
 mod out_folder;
+mod prepare;
 mod run_record;
 mod supervisor;
 mod training;
@@ -41,7 +44,11 @@ fn main() -> ExitCode {
         Command::Bench(args) => commands::bench::run(&args),
         Command::BenchSide(args) => commands::bench::side::run(&args),
         Command::Benchmark(args) => commands::benchmark::run(&args, cli.verbose),
+        Command::Coordinator(args) => commands::coordinator::run(&args),
         Command::Worker(args) => commands::worker::run(args),
+        Command::Submit(args) => commands::submit::run(&args, json),
+        Command::Status(args) => commands::status::run(&args),
+        Command::Cancel(args) => commands::status::cancel(&args),
     };
     match done {
         Ok(Outcome { text, value, skipped_views }) => {

@@ -19,7 +19,7 @@ use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use planesweep_report::{PreviewOptions, draw_preview, encode_png};
 use planesweep_scene::{
     Camera, DepthHypotheses, DepthMap, DepthRange, Raster, Sampling, ViewId, write_atomically, write_pfm,
@@ -137,6 +137,19 @@ impl OutFolder {
         fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
         Ok(path)
     }
+}
+
+/// Refuses an output folder that would be written over the scene or cannot be named on the wire.
+pub fn check_out(out: &Path, scene: &Path) -> Result<()> {
+    fs::create_dir_all(out).with_context(|| format!("cannot make the folder {}", out.display()))?;
+    let out = out.canonicalize().with_context(|| format!("cannot find {}", out.display()))?;
+    if scene.canonicalize().is_ok_and(|scene| scene == out) {
+        bail!("the result would be written over the scene; choose another folder for -o");
+    }
+    if out.to_str().is_none() {
+        bail!("the path of {} is not UTF-8; choose another folder for -o", out.display());
+    }
+    Ok(())
 }
 
 fn stem(name: &str) -> String {

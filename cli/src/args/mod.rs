@@ -1,5 +1,6 @@
 //! The command line: what several commands share; the arguments of one command stand with it.
 
+mod cluster;
 mod fusion;
 mod inference;
 mod scene;
@@ -7,6 +8,7 @@ pub mod values;
 
 use clap::{Parser, Subcommand};
 
+pub use self::cluster::{ConnectArgs, TokenArgs, store_url};
 pub use self::fusion::FilterArgs;
 pub use self::inference::{NetworkArgs, PlanArgs};
 pub use self::scene::ReadArgs;
@@ -14,12 +16,15 @@ use crate::commands::bench::BenchArgs;
 use crate::commands::bench::side::SideArgs;
 use crate::commands::benchmark::BenchmarkArgs;
 use crate::commands::convert::ConvertArgs;
+use crate::commands::coordinator::CoordinatorArgs;
 use crate::commands::depth::DepthArgs;
 use crate::commands::evaluate::EvaluateCommand;
 use crate::commands::fuse::FuseArgs;
 use crate::commands::inspect::InspectArgs;
 use crate::commands::reconstruct::ReconstructArgs;
 use crate::commands::render_depth::RenderDepthArgs;
+use crate::commands::status::{CancelArgs, StatusArgs};
+use crate::commands::submit::SubmitArgs;
 use crate::commands::synth::SynthArgs;
 use crate::commands::train::TrainArgs;
 use crate::commands::weights::WeightsCommand;
@@ -77,8 +82,16 @@ pub enum Command {
     BenchSide(SideArgs),
     /// Reconstruct and evaluate the scenes of a benchmark, beside the published figures.
     Benchmark(BenchmarkArgs),
+    /// Hand out the jobs of submitted scenes to workers on any hosts.
+    Coordinator(CoordinatorArgs),
     /// Work for a coordinator until it says stop.
     Worker(WorkerArgs),
+    /// Have a scene reconstructed by the workers of a coordinator.
+    Submit(SubmitArgs),
+    /// Say how far the runs of a coordinator are.
+    Status(StatusArgs),
+    /// Stop a run.
+    Cancel(CancelArgs),
 }
 
 #[cfg(test)]

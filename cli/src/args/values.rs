@@ -1,4 +1,6 @@
-//! Values that clap does not know: sizes, shares, ranges, pixels.
+//! Values that clap does not know: sizes, shares, ranges, pixels, times.
+
+use std::time::Duration;
 
 /// A number from 0 to 1.
 pub fn share(text: &str) -> Result<f32, String> {
@@ -44,6 +46,14 @@ pub fn bytes(text: &str) -> Result<u64, String> {
     let number: f64 = digits.parse().map_err(|_| format!("{text} is no size; write it like 800M or 2G"))?;
     let size = number * (1_u64 << shift) as f64;
     if (1.0..1e18).contains(&size) { Ok(size as u64) } else { Err(format!("{text} is no size")) }
+}
+
+/// A positive number of seconds.
+pub fn seconds(text: &str) -> Result<Duration, String> {
+    let value: f64 = text.parse().map_err(|_| format!("{text} is not a number"))?;
+    let duration =
+        Duration::try_from_secs_f64(value).map_err(|_| format!("{text} is no number of seconds"))?;
+    if duration.is_zero() { Err(format!("{text} is not positive")) } else { Ok(duration) }
 }
 
 /// A pixel, column and row, as "X,Y".

@@ -1,6 +1,7 @@
 //! From the results in the store to the files that people use.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
@@ -20,11 +21,10 @@ use rayon::prelude::*;
 use serde_json::json;
 use tokio::runtime::Runtime;
 
-use super::reconstruct::ReconstructArgs;
-use super::reconstruct::{Prepared, Stages};
 use crate::console::Outcome;
 use crate::input::{Skipped, all_skipped};
 use crate::out_folder::{OutFolder, depth_range, trajectory};
+use crate::prepare::{Prepared, Stages};
 use crate::run_record::{FILE_NAME, RecordedView, RunRecord};
 
 /// Size of the picture of the cloud in the report.
@@ -35,7 +35,7 @@ type ByView<'a> = BTreeMap<(&'static str, Option<ViewId>), Vec<&'a JobResult>>;
 
 /// A run whose jobs have ended.
 pub struct Finished<'a> {
-    args: &'a ReconstructArgs,
+    out: &'a Path,
     prepared: &'a Prepared,
     store: &'a Store,
     runtime: &'a Runtime,
@@ -46,13 +46,13 @@ pub struct Finished<'a> {
 impl<'a> Finished<'a> {
     /// Of the jobs' results, whose blobs are in the store.
     pub fn new(
-        args: &'a ReconstructArgs,
+        out: &'a Path,
         prepared: &'a Prepared,
         store: &'a Store,
         runtime: &'a Runtime,
         results: &'a [JobResult],
     ) -> Self {
-        Self { args, prepared, store, runtime, results, by_view: by_view(&prepared.jobs, results) }
+        Self { out, prepared, store, runtime, results, by_view: by_view(&prepared.jobs, results) }
     }
 
     fn result(&self, kind: &'static str, view: Option<ViewId>) -> Option<&'a JobResult> {
@@ -81,7 +81,7 @@ pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Out
     let writing = Instant::now();
     let scene = &run.prepared.input.scene;
     let planned = run.prepared.plan.views.iter().map(|v| (v.view, scene.views[&v.view].name.as_str()));
-    let out = OutFolder::create(&run.args.out, planned)?;
+    let out = OutFolder::create(run.out, planned)?;
     out.clear()?;
     let mut views: Vec<&ViewPlan> = run.prepared.plan.views.iter().collect();
     views.sort_by_key(|view| view.view);
@@ -295,11 +295,11 @@ fn record(
     RunRecord {
         version: CODE_VERSION.to_owned(),
         numerics_version: NUMERICS_VERSION,
-        scene: run.args.scene.clone(),
+        scene: run.prepared.scene_path.clone(),
         options: run.prepared.plan.options.clone(),
-        device: run.args.network.device.clone(),
-        weights_blake3: run.prepared.weights_key,
-        weights: run.prepared.weights.metadata().clone(),
+        device: run.prepared.network.device.clone(),
+        weights_blake3: run.prepared.network.key,
+        weights: run.prepared.network.weights.metadata().clone(),
         views: views.iter().map(|view| view.record.clone()).collect(),
         skipped: skipped.to_vec(),
         points,
@@ -329,16 +329,16 @@ fn report(
         ("reprojection threshold in pixels of the depth map", json!(filter.max_reprojection_px)),
         ("relative depth threshold", json!(filter.max_relative_depth)),
         ("fusion neighbours", json!(options.fusion_views)),
-        ("device", json!(run.args.network.device)),
-        ("weights", json!(run.args.network.weights)),
+        ("device", json!(run.prepared.network.device)),
+        ("weights", json!(run.prepared.network.file)),
     ];
     let versions = [
         ("planesweep", CODE_VERSION.to_owned()),
         ("numerics", NUMERICS_VERSION.to_string()),
-        ("weights blake3", run.prepared.weights_key.to_string()),
+        ("weights blake3", run.prepared.network.key.to_string()),
     ];
     RunReport {
-        scene: run.args.scene.display().to_string(),
+        scene: run.prepared.scene_path.display().to_string(),
         settings: settings.map(|(name, value)| (name.to_owned(), value)).into(),
         versions: versions.map(|(name, value)| (name.to_owned(), value)).into(),
         stages: stages

@@ -3,6 +3,7 @@
 pub mod bench;
 pub mod benchmark;
 pub mod convert;
+pub mod coordinator;
 pub mod depth;
 pub mod evaluate;
 mod export;
@@ -10,6 +11,8 @@ pub mod fuse;
 pub mod inspect;
 pub mod reconstruct;
 pub mod render_depth;
+pub mod status;
+pub mod submit;
 pub mod synth;
 pub mod train;
 pub mod weights;

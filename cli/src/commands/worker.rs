@@ -10,6 +10,7 @@ use planesweep_worker::{WorkerConfig, run_worker};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
+use crate::args::ConnectArgs;
 use crate::args::values::bytes;
 use crate::console::Outcome;
 use crate::network::{Placement, backend_factory, processors};
@@ -18,12 +19,8 @@ use crate::network::{Placement, backend_factory, processors};
 #[derive(Debug, Args)]
 #[command(after_help = "Example: planesweep worker --coordinator http://10.0.0.1:7070 --role both")]
 pub struct WorkerArgs {
-    /// The coordinator's address.
-    #[arg(long, env = "PLANESWEEP_COORDINATOR")]
-    pub coordinator: String,
-    /// The token that the coordinator wants.
-    #[arg(long, env = "PLANESWEEP_TOKEN", hide_env_values = true)]
-    pub token: Option<String>,
+    #[command(flatten)]
+    pub connect: ConnectArgs,
     /// Which jobs it takes.
     #[arg(long, value_enum, default_value = "both")]
     pub role: RoleArg,
@@ -69,8 +66,8 @@ pub fn run(args: WorkerArgs) -> Result<Outcome> {
     // A new one for every life of the process: the kernel makes it.
     let nonce = read_system("/proc/sys/kernel/random/uuid").context("cannot make an id for this worker")?;
     let config = WorkerConfig {
-        coordinator: args.coordinator,
-        token: args.token,
+        coordinator: args.connect.coordinator,
+        token: args.connect.token.read()?,
         id: WorkerId(format!("{host}-{}-{}", std::process::id(), &nonce[..8.min(nonce.len())])),
         host,
         boot_id,

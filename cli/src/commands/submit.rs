@@ -1,0 +1,97 @@
+//! `planesweep submit`: a scene for a coordinator elsewhere.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::{Context, Result};
+use clap::Args;
+use planesweep_worker::Store;
+use serde_json::json;
+
+use super::export::{self, Finished};
+use crate::args::{ConnectArgs, FilterArgs, PlanArgs, ReadArgs};
+use crate::computation::Computation;
+use crate::console::Outcome;
+use crate::interrupts::Interrupts;
+use crate::out_folder::check_out;
+use crate::prepare::{Network, Prepared, Stages};
+
+/// Arguments of `submit`.
+#[derive(Debug, Args)]
+#[command(
+    after_help = "The same command again shares all that is done or under way; with -o it fetches the result of a \
+    run that has ended.\n\
+    Example: planesweep submit my-colmap-project -o out --coordinator http://10.0.0.1:7070"
+)]
+pub struct SubmitArgs {
+    /// The scene.
+    pub scene: PathBuf,
+    /// Wait for the end, then write the result here.
+    #[arg(short, long, required_unless_present = "detach")]
+    pub out: Option<PathBuf>,
+    /// Print the run's id and wait for nothing.
+    #[arg(long, conflicts_with = "out")]
+    pub detach: bool,
+    #[command(flatten)]
+    pub connect: ConnectArgs,
+    /// The weights, as `weights import` and `train` write them; by default those that come with the program.
+    #[arg(long, env = "PLANESWEEP_WEIGHTS", value_name = "FILE")]
+    pub weights: Option<PathBuf>,
+    /// Where the workers infer; only `analytic`, the test double, makes a difference.
+    #[arg(long, hide = true, default_value = "cpu")]
+    pub device: String,
+    #[command(flatten)]
+    pub plan: PlanArgs,
+    #[command(flatten)]
+    pub filter: FilterArgs,
+    #[command(flatten)]
+    pub read: ReadArgs,
+}
+
+/// Submits a scene; waits and fetches the result unless told not to.
+pub fn run(args: &SubmitArgs, json: bool) -> Result<Outcome> {
+    let begun = Instant::now();
+    let mut stages = Stages::new();
+    let runtime = tokio::runtime::Runtime::new().context("cannot start the runtime")?;
+    // Before anything that takes long.
+    let (client, store) = runtime.block_on(async {
+        let mut client = args.connect.client()?;
+        let url = client.store_url().await;
+        let url = url.with_context(|| format!("cannot submit to {}", args.connect.coordinator))?;
+        Ok::<_, anyhow::Error>((client, Store::open(&url)?))
+    })?;
+    if let Some(out) = &args.out {
+        check_out(out, &args.scene)?;
+    }
+    let network = Network::read(args.weights.as_deref(), &args.device)?;
+    let options = args.plan.options(Some(&args.filter));
+    let prepared = Prepared::new(&args.scene, network, &options, &args.read.options(), &mut stages)?;
+    if !json {
+        eprintln!("{} views to infer, {} left out", prepared.plan.views.len(), prepared.left_out());
+    }
+    let put = store.put(prepared.network.bytes.clone().into());
+    runtime.block_on(put).context("cannot store the weights")?;
+    let computation = Computation { client, store: &store, prepared: &prepared, exclusive: false };
+    let Some(out) = &args.out else {
+        let submitted = runtime.block_on(computation.submit(Vec::new()))?;
+        let value = json!({ "run": submitted.run.0, "jobs": submitted.jobs, "reused": submitted.reused });
+        let skipped_views = prepared.left_out() > 0;
+        return Ok(Outcome { text: format!("{}\n", submitted.run.0), value, skipped_views });
+    };
+    let computing = Instant::now();
+    let results = runtime.block_on(async {
+        let interrupts = Interrupts::default();
+        interrupts.clone().listen("no longer waiting", None);
+        let say_run = |run: &_| {
+            eprintln!("run {run}");
+            Ok(())
+        };
+        let results = computation.run(&interrupts.drain, say_run).await?;
+        interrupts.computed.cancel();
+        results.context(
+            "stopped waiting; the run goes on: the same command again waits for it, `planesweep cancel` stops it",
+        )
+    })?;
+    stages.push(("compute".to_owned(), computing.elapsed().as_secs_f64()));
+    export::run(&Finished::new(out, &prepared, &store, &runtime, &results), stages, begun)
+}
