@@ -51,8 +51,17 @@ impl Bench {
     /// Starts `planesweep reconstruct --json` into `out`, with `more` options in place of the easy ones
     /// of the same name, or after them.
     pub fn start(&self, out: &str, more: &[&str]) -> Running {
+        self.start_command("reconstruct", out, more)
+    }
+
+    /// The same with `planesweep submit`.
+    pub fn submit(&self, out: &str, coordinator: &str, more: &[&str]) -> Running {
+        self.start_command("submit", out, &[&["--coordinator", coordinator], more].concat())
+    }
+
+    fn start_command(&self, command: &str, out: &str, more: &[&str]) -> Running {
         let (scene, out, weights) = (self.scene(), self.path(out), self.weights());
-        let given = ["reconstruct", &scene, "-o", &out, "--weights", &weights, "--json"];
+        let given = [command, &scene, "-o", &out, "--weights", &weights, "--json"];
         let easy = EASY.chunks(2).filter(|option| !more.contains(&option[0])).flatten();
         Running::start(given.iter().chain(easy).chain(more))
     }

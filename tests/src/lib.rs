@@ -7,6 +7,7 @@
 
 mod bench;
 pub mod benchmarks;
+mod cluster;
 mod convert_middlebury;
 mod convert_rgbd;
 mod data;
@@ -17,6 +18,7 @@ mod scenes;
 mod shared_scenes;
 
 pub use bench::Bench;
+pub use cluster::Cluster;
 pub use convert_middlebury::{Bounds, convert_middlebury};
 pub use convert_rgbd::convert_rgbd;
 pub use data::{reference_weights, shared_data};

@@ -1,0 +1,78 @@
+//! A coordinator and workers as processes of their own.
+
+use std::time::Duration;
+
+use crate::bench::Bench;
+use crate::faults::{send, wait_until};
+use crate::program::Running;
+
+/// How long a process may take to say that it is ready.
+const READY: Duration = Duration::from_mins(2);
+/// A dead worker is noticed soon, and one that waits for its turn on a busy machine is not taken for dead.
+const LEASE_SECONDS: &str = "3";
+
+/// A coordinator whose ledger and store lie in the folder of a bench.
+pub struct Cluster {
+    url: String,
+    options: Vec<String>,
+    coordinator: Running,
+}
+
+impl Cluster {
+    /// Starts a coordinator on a free port, with `more` options.
+    #[track_caller]
+    pub fn start(bench: &Bench, more: &[&str]) -> Self {
+        let (ledger, store) = (bench.path("ledger.sqlite"), bench.path("store"));
+        let options = ["--ledger", &ledger, "--store", &store, "--lease", LEASE_SECONDS];
+        let options: Vec<String> = options.iter().chain(more).map(ToString::to_string).collect();
+        let coordinator = listening("127.0.0.1:0", &options);
+        let url = said_url(&coordinator).expect("it listens");
+        Self { url, options, coordinator }
+    }
+
+    /// Its address.
+    pub fn url(&self) -> &str {
+        &self.url
+    }
+
+    /// The coordinator's process.
+    pub fn coordinator(&mut self) -> &mut Running {
+        &mut self.coordinator
+    }
+
+    /// Kills the coordinator and starts another on the same ledger and address.
+    #[track_caller]
+    pub fn kill_and_restart(&mut self) {
+        assert!(self.coordinator.is_running() && send("KILL", self.coordinator.pid()));
+        assert!(wait_until(READY, || !self.coordinator.is_running()), "it cannot be killed");
+        let address = self.url.rsplit('/').next().expect("an address").to_owned();
+        self.coordinator = listening(&address, &self.options);
+    }
+
+    /// Starts a worker.
+    pub fn worker(&self, more: &[&str]) -> Running {
+        let given = ["worker", "--coordinator", &self.url, "--threads", "1"];
+        Running::start(given.iter().chain(more))
+    }
+
+    /// Ends the coordinator as a service manager does; it takes its workers with it.
+    pub fn drain(self) -> Running {
+        assert!(send("TERM", self.coordinator.pid()), "{}", self.coordinator.stderr());
+        self.coordinator
+    }
+}
+
+#[track_caller]
+fn listening(address: &str, options: &[String]) -> Running {
+    let given = ["coordinator", "--listen", address].map(str::to_owned);
+    let mut coordinator = Running::start(given.iter().chain(options));
+    let is_ready = wait_until(READY, || said_url(&coordinator).is_some() || !coordinator.is_running());
+    assert!(is_ready && coordinator.is_running(), "no coordinator: {}", coordinator.stderr());
+    coordinator
+}
+
+fn said_url(coordinator: &Running) -> Option<String> {
+    let said = coordinator.stderr();
+    let (line, _) = said.split_once("listening on ")?.1.split_once('\n')?;
+    Some(line.to_owned())
+}

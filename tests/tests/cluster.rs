@@ -1,0 +1,152 @@
+//! A coordinator, workers and clients as processes of their own: the cloud is that of one process, whatever
+//! happens to them.
+
+use std::time::Duration;
+
+use planesweep_tests::{Bench, Cluster, Running, courtyard, is_alive, run, send, wait_until};
+
+/// How long a state may take to come; far above what it ever takes.
+const DEADLINE: Duration = Duration::from_mins(5);
+
+/// Eight views, each slow enough for a fault to meet it.
+const SLOW: [&str; 2] = ["--depths", "128"];
+const TORCH: [&str; 2] = ["--device", "torch"];
+
+fn of_courtyard() -> Bench {
+    Bench::new(|folder| courtyard(folder, 8, 320, 256))
+}
+
+/// The undisturbed cloud, by one process of its own.
+fn calm(bench: &Bench) {
+    let _ = bench.reconstruct("calm", &[&SLOW[..], &TORCH, &["--workers", "2"]].concat()).expect_code(0);
+}
+
+#[track_caller]
+fn wait_for_results(run: &Running, count: usize) {
+    let done = |line: &str| line.split_once("/25 jobs").and_then(|(done, _)| done.parse().ok());
+    let is_there = || run.stderr().lines().filter_map(done).any(|jobs: usize| jobs >= count);
+    assert!(wait_until(DEADLINE, is_there), "no result: {}", run.stderr());
+}
+
+#[track_caller]
+fn same_cloud(bench: &Bench, one: &str, other: &str) {
+    let read = |out: &str| bench.read(&format!("{out}/cloud.ply"));
+    assert!(read(one).len() > 10_000 && read(one) == read(other), "{one} and {other} differ");
+}
+
+#[test]
+fn a_cluster_gives_the_cloud_of_one_process_and_is_told_to_go() {
+    let bench = Bench::new(|folder| courtyard(folder, 4, 160, 128));
+    let alone = bench.reconstruct("alone", &["--workers", "1"]).expect_code(0).json();
+    let mut cluster = Cluster::start(&bench, &[]);
+    let url = cluster.url().to_owned();
+    let nothing = run(["status", "--coordinator", &url, "--json"]).expect_code(0).json();
+    assert_eq!(nothing["runs"].as_array().map(Vec::len), Some(0));
+
+    let detached = run([
+        "submit",
+        &bench.scene(),
+        "--detach",
+        "--coordinator",
+        &url,
+        "--weights",
+        &bench.weights(),
+        "--json",
+        "--depths",
+        "40",
+    ]);
+    let id = detached.expect_code(0).json()["run"].as_str().expect("an id").to_owned();
+    assert_eq!(id, "scene-1");
+    let waiting = run(["status", &id, "--coordinator", &url, "--json"]).expect_code(0).json();
+    assert_eq!((&waiting["state"], &waiting["jobs"]["infer"]["open"]), (&"running".into(), &4.into()));
+    let _ = run(["cancel", &id, "--coordinator", &url]).expect_code(0);
+    let unknown = run(["cancel", "no-such-run", "--coordinator", &url]).expect_code(1);
+    assert!(unknown.stderr.contains("no-such-run"), "{}", unknown.stderr);
+
+    let workers = [cluster.worker(&[]), cluster.worker(&[])];
+    let together = bench.submit("together", &url, &[]).wait().expect_code(0).json();
+    assert!(together["points"].as_u64() > Some(500), "{}", together["points"]);
+    assert_eq!(alone["cloud_blake3"], together["cloud_blake3"]);
+    for name in ["cloud.ply", "pair.txt", "depth/00000000.pfm", "confidence/00000003.pfm"] {
+        let read = |out: &str| bench.read(&format!("{out}/{name}"));
+        assert!(read("alone") == read("together"), "{name} differs");
+    }
+
+    let runs = run(["status", "--coordinator", &url, "--json"]).expect_code(0).json();
+    let states = ["finished", "cancelled"].map(serde_json::Value::from);
+    assert_eq!([&runs["runs"][0]["state"], &runs["runs"][1]["state"]], [&states[0], &states[1]], "{runs}");
+    let watched = run(["status", "--watch", "--coordinator", &url, "--json"]).expect_code(0).json();
+    assert_eq!(watched["workers"].as_array().map(Vec::len), Some(2));
+    let again = bench.submit("again", &url, &[]).wait().expect_code(0);
+    assert!(again.stderr.contains("13 of 13 jobs are done already"), "{}", again.stderr);
+
+    assert!(cluster.coordinator().is_running());
+    let ended = cluster.drain().wait().expect_code(0);
+    assert!(ended.stderr.contains("stopping when the running jobs are done"), "{}", ended.stderr);
+    for worker in workers {
+        let _ = worker.wait().expect_code(0);
+    }
+}
+
+#[test]
+fn killed_workers_cost_no_view() {
+    let bench = of_courtyard();
+    calm(&bench);
+    let cluster = Cluster::start(&bench, &[]);
+    let mut workers = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
+    let mut struck = bench.submit("struck", cluster.url(), &SLOW);
+    wait_for_results(&struck, 1);
+    for worker in &mut workers {
+        assert!(worker.is_running() && send("KILL", worker.pid()));
+    }
+    assert!(wait_until(DEADLINE, || workers.iter().all(|worker| !is_alive(worker.pid()))));
+    assert!(struck.is_running(), "{}", struck.stderr());
+    let _successors = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
+    let _ = struck.wait().expect_code(0);
+    same_cloud(&bench, "calm", "struck");
+}
+
+#[test]
+fn a_killed_coordinator_is_restarted_and_loses_nothing() {
+    let bench = of_courtyard();
+    calm(&bench);
+    let mut cluster = Cluster::start(&bench, &[]);
+    let _workers = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
+    let mut struck = bench.submit("struck", cluster.url(), &SLOW);
+    for results in [1, 4] {
+        wait_for_results(&struck, results);
+        assert!(struck.is_running(), "{}", struck.stderr());
+        cluster.kill_and_restart();
+    }
+    let struck = struck.wait().expect_code(0);
+    assert!(struck.stderr.contains("the coordinator is back"), "{}", struck.stderr);
+    let status = run(["status", "scene-1", "--coordinator", cluster.url(), "--json"]).expect_code(0).json();
+    let done: u64 = ["infer", "filter", "emit", "assemble"]
+        .iter()
+        .map(|kind| status["jobs"][kind]["done"].as_u64().unwrap_or(0))
+        .sum();
+    assert_eq!(done, 25, "{status}");
+    same_cloud(&bench, "calm", "struck");
+}
+
+#[test]
+fn who_has_no_token_is_refused_and_other_hosts_are_not_let_in_without_one() {
+    let bench = Bench::new(|folder| courtyard(folder, 3, 96, 96));
+    let (ledger, store) = (bench.path("ledger.sqlite"), bench.path("store"));
+    let open = ["coordinator", "--listen", "0.0.0.0:0", "--ledger", &ledger, "--store", &store];
+    let refused = run(open).expect_code(1);
+    assert!(refused.stderr.contains("a token is needed"), "{}", refused.stderr);
+
+    let (token, wrong) = (bench.path("token"), bench.path("wrong"));
+    std::fs::write(&token, "s3cret\n").expect("written");
+    std::fs::write(&wrong, "secret\n").expect("written");
+    let cluster = Cluster::start(&bench, &["--token-file", &token]);
+    let _worker = cluster.worker(&["--token-file", &token]);
+    for more in [&[][..], &["--token-file", &wrong]] {
+        let refused = bench.submit("out", cluster.url(), more).wait().expect_code(1);
+        assert!(refused.stderr.contains("unauthenticated"), "{}", refused.stderr);
+        let refused = cluster.worker(more).wait().expect_code(1);
+        assert!(refused.stderr.contains("unauthenticated"), "{}", refused.stderr);
+    }
+    let _ = bench.submit("out", cluster.url(), &["--token-file", &token]).wait().expect_code(0);
+}
