@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 use planesweep_plan::{JobId, RunId};
 use planesweep_proto::{Client, JobResult, JobState, RunStatus, ServiceError, SubmitHeader, Submitted};
 use planesweep_scene::ViewId;
-use planesweep_worker::Store;
+use planesweep_store::Store;
 use tokio_util::sync::CancellationToken;
 
 use crate::console::Progress;

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use tempfile::TempDir;
 
+use crate::cluster::Cluster;
 use crate::program::{Finished, Running};
 use crate::scenes::seeded_weights;
 
@@ -51,19 +52,26 @@ impl Bench {
     /// Starts `planesweep reconstruct --json` into `out`, with `more` options in place of the easy ones
     /// of the same name, or after them.
     pub fn start(&self, out: &str, more: &[&str]) -> Running {
-        self.start_command("reconstruct", out, more)
+        self.start_command(&[], "reconstruct", out, more)
     }
 
-    /// The same with `planesweep submit`.
-    pub fn submit(&self, out: &str, coordinator: &str, more: &[&str]) -> Running {
-        self.start_command("submit", out, &[&["--coordinator", coordinator], more].concat())
+    /// The same with `planesweep submit` to a cluster.
+    pub fn submit(&self, out: &str, cluster: &Cluster, more: &[&str]) -> Running {
+        let more = [&["--coordinator", cluster.url()], more].concat();
+        self.start_command(cluster.environment(), "submit", out, &more)
     }
 
-    fn start_command(&self, command: &str, out: &str, more: &[&str]) -> Running {
+    fn start_command(
+        &self,
+        environment: &[(&'static str, String)],
+        command: &str,
+        out: &str,
+        more: &[&str],
+    ) -> Running {
         let (scene, out, weights) = (self.scene(), self.path(out), self.weights());
         let given = [command, &scene, "-o", &out, "--weights", &weights, "--json"];
         let easy = EASY.chunks(2).filter(|option| !more.contains(&option[0])).flatten();
-        Running::start(given.iter().chain(easy).chain(more))
+        Running::start_in(environment, given.iter().chain(easy).chain(more))
     }
 
     /// [`Bench::start`], and waits for the end.

@@ -14,6 +14,7 @@ const LEASE_SECONDS: &str = "3";
 /// A coordinator whose ledger and store lie in the folder of a bench.
 pub struct Cluster {
     url: String,
+    environment: Vec<(&'static str, String)>,
     options: Vec<String>,
     coordinator: Running,
 }
@@ -22,12 +23,27 @@ impl Cluster {
     /// Starts a coordinator on a free port, with `more` options.
     #[track_caller]
     pub fn start(bench: &Bench, more: &[&str]) -> Self {
-        let (ledger, store) = (bench.path("ledger.sqlite"), bench.path("store"));
-        let options = ["--ledger", &ledger, "--store", &store, "--lease", LEASE_SECONDS];
+        Self::start_on(&bench.path("ledger.sqlite"), &bench.path("store"), Vec::new(), more)
+    }
+
+    /// The same with a ledger and a store elsewhere, which the variables of `environment` open.
+    #[track_caller]
+    pub fn start_on(
+        ledger: &str,
+        store: &str,
+        environment: Vec<(&'static str, String)>,
+        more: &[&str],
+    ) -> Self {
+        let options = ["--ledger", ledger, "--store", store, "--lease", LEASE_SECONDS];
         let options: Vec<String> = options.iter().chain(more).map(ToString::to_string).collect();
-        let coordinator = listening("127.0.0.1:0", &options);
+        let coordinator = listening("127.0.0.1:0", &environment, &options);
         let url = said_url(&coordinator).expect("it listens");
-        Self { url, options, coordinator }
+        Self { url, environment, options, coordinator }
+    }
+
+    /// The variables that its processes have.
+    pub fn environment(&self) -> &[(&'static str, String)] {
+        &self.environment
     }
 
     /// Its address.
@@ -46,13 +62,13 @@ impl Cluster {
         assert!(self.coordinator.is_running() && send("KILL", self.coordinator.pid()));
         assert!(wait_until(READY, || !self.coordinator.is_running()), "it cannot be killed");
         let address = self.url.rsplit('/').next().expect("an address").to_owned();
-        self.coordinator = listening(&address, &self.options);
+        self.coordinator = listening(&address, &self.environment, &self.options);
     }
 
     /// Starts a worker.
     pub fn worker(&self, more: &[&str]) -> Running {
         let given = ["worker", "--coordinator", &self.url, "--threads", "1"];
-        Running::start(given.iter().chain(more))
+        Running::start_in(&self.environment, given.iter().chain(more))
     }
 
     /// Ends the coordinator as a service manager does; it takes its workers with it.
@@ -63,9 +79,9 @@ impl Cluster {
 }
 
 #[track_caller]
-fn listening(address: &str, options: &[String]) -> Running {
+fn listening(address: &str, environment: &[(&'static str, String)], options: &[String]) -> Running {
     let given = ["coordinator", "--listen", address].map(str::to_owned);
-    let mut coordinator = Running::start(given.iter().chain(options));
+    let mut coordinator = Running::start_in(environment, given.iter().chain(options));
     let is_ready = wait_until(READY, || said_url(&coordinator).is_some() || !coordinator.is_running());
     assert!(is_ready && coordinator.is_running(), "no coordinator: {}", coordinator.stderr());
     coordinator

@@ -14,6 +14,7 @@ mod data;
 mod faults;
 mod program;
 mod results;
+mod s3;
 mod scenes;
 mod shared_scenes;
 
@@ -25,5 +26,6 @@ pub use data::{reference_weights, shared_data};
 pub use faults::{children, is_alive, send, wait_until};
 pub use program::{Finished, Running, run};
 pub use results::{blobs, confident_share, files_below};
+pub use s3::S3Server;
 pub use scenes::{courtyard, plane, plane_of_size, seeded_weights, seeded_weights_with};
 pub use shared_scenes::shared_scenes;

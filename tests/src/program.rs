@@ -54,12 +54,21 @@ pub struct Running {
 impl Running {
     /// Starts `planesweep` with these arguments and an empty standard input.
     pub fn start<S: AsRef<OsStr>>(arguments: impl IntoIterator<Item = S>) -> Self {
+        Self::start_in(&[], arguments)
+    }
+
+    /// The same with more variables in its environment.
+    pub fn start_in<S: AsRef<OsStr>>(
+        environment: &[(&'static str, String)],
+        arguments: impl IntoIterator<Item = S>,
+    ) -> Self {
         let output = tempfile::tempdir().expect("a temporary folder");
         let file = |name: &str| File::create(output.path().join(name)).expect("a temporary file");
         let child = Command::new(program())
             .args(arguments)
             .env_remove("PLANESWEEP_WEIGHTS")
             .env_remove("PLANESWEEP_LOG")
+            .envs(environment.iter().cloned())
             .stdin(Stdio::null())
             .stdout(file("stdout"))
             .stderr(file("stderr"))

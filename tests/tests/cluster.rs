@@ -1,9 +1,10 @@
 //! A coordinator, workers and clients as processes of their own: the cloud is that of one process, whatever
 //! happens to them.
 
+use std::path::Path;
 use std::time::Duration;
 
-use planesweep_tests::{Bench, Cluster, Running, courtyard, is_alive, run, send, wait_until};
+use planesweep_tests::{Bench, Cluster, Running, S3Server, courtyard, is_alive, run, send, wait_until};
 
 /// How long a state may take to come; far above what it ever takes.
 const DEADLINE: Duration = Duration::from_mins(5);
@@ -64,7 +65,7 @@ fn a_cluster_gives_the_cloud_of_one_process_and_is_told_to_go() {
     assert!(unknown.stderr.contains("no-such-run"), "{}", unknown.stderr);
 
     let workers = [cluster.worker(&[]), cluster.worker(&[])];
-    let together = bench.submit("together", &url, &[]).wait().expect_code(0).json();
+    let together = bench.submit("together", &cluster, &[]).wait().expect_code(0).json();
     assert!(together["points"].as_u64() > Some(500), "{}", together["points"]);
     assert_eq!(alone["cloud_blake3"], together["cloud_blake3"]);
     for name in ["cloud.ply", "pair.txt", "depth/00000000.pfm", "confidence/00000003.pfm"] {
@@ -77,7 +78,7 @@ fn a_cluster_gives_the_cloud_of_one_process_and_is_told_to_go() {
     assert_eq!([&runs["runs"][0]["state"], &runs["runs"][1]["state"]], [&states[0], &states[1]], "{runs}");
     let watched = run(["status", "--watch", "--coordinator", &url, "--json"]).expect_code(0).json();
     assert_eq!(watched["workers"].as_array().map(Vec::len), Some(2));
-    let again = bench.submit("again", &url, &[]).wait().expect_code(0);
+    let again = bench.submit("again", &cluster, &[]).wait().expect_code(0);
     assert!(again.stderr.contains("13 of 13 jobs are done already"), "{}", again.stderr);
 
     assert!(cluster.coordinator().is_running());
@@ -94,7 +95,7 @@ fn killed_workers_cost_no_view() {
     calm(&bench);
     let cluster = Cluster::start(&bench, &[]);
     let mut workers = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
-    let mut struck = bench.submit("struck", cluster.url(), &SLOW);
+    let mut struck = bench.submit("struck", &cluster, &SLOW);
     wait_for_results(&struck, 1);
     for worker in &mut workers {
         assert!(worker.is_running() && send("KILL", worker.pid()));
@@ -112,7 +113,7 @@ fn a_killed_coordinator_is_restarted_and_loses_nothing() {
     calm(&bench);
     let mut cluster = Cluster::start(&bench, &[]);
     let _workers = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
-    let mut struck = bench.submit("struck", cluster.url(), &SLOW);
+    let mut struck = bench.submit("struck", &cluster, &SLOW);
     for results in [1, 4] {
         wait_for_results(&struck, results);
         assert!(struck.is_running(), "{}", struck.stderr());
@@ -130,6 +131,29 @@ fn a_killed_coordinator_is_restarted_and_loses_nothing() {
 }
 
 #[test]
+fn an_s3_store_that_is_gone_for_a_while_loses_nothing() {
+    let bench = of_courtyard();
+    calm(&bench);
+    let mut server = S3Server::start(Path::new(&bench.path("s3")));
+    let ledger = bench.path("ledger.sqlite");
+    let cluster = Cluster::start_on(&ledger, &server.store_url(), server.environment(), &[]);
+    let workers = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
+    let mut struck = bench.submit("struck", &cluster, &SLOW);
+    wait_for_results(&struck, 1);
+    assert!(struck.is_running());
+    server.go_away();
+    let is_noticed = || workers.iter().any(|worker| worker.stderr().contains("the store does not answer"));
+    assert!(wait_until(DEADLINE, is_noticed), "{}", workers[0].stderr());
+    server.come_back();
+    let _ = struck.wait().expect_code(0);
+    let is_mended = || workers.iter().any(|worker| worker.stderr().contains("the store works again"));
+    assert!(wait_until(DEADLINE, is_mended), "{}", workers[0].stderr());
+    let status = run(["status", "scene-1", "--coordinator", cluster.url(), "--json"]).expect_code(0).json();
+    assert_eq!(status["failures"], serde_json::json!([]));
+    same_cloud(&bench, "calm", "struck");
+}
+
+#[test]
 fn who_has_no_token_is_refused_and_other_hosts_are_not_let_in_without_one() {
     let bench = Bench::new(|folder| courtyard(folder, 3, 96, 96));
     let (ledger, store) = (bench.path("ledger.sqlite"), bench.path("store"));
@@ -143,10 +167,10 @@ fn who_has_no_token_is_refused_and_other_hosts_are_not_let_in_without_one() {
     let cluster = Cluster::start(&bench, &["--token-file", &token]);
     let _worker = cluster.worker(&["--token-file", &token]);
     for more in [&[][..], &["--token-file", &wrong]] {
-        let refused = bench.submit("out", cluster.url(), more).wait().expect_code(1);
+        let refused = bench.submit("out", &cluster, more).wait().expect_code(1);
         assert!(refused.stderr.contains("unauthenticated"), "{}", refused.stderr);
         let refused = cluster.worker(more).wait().expect_code(1);
         assert!(refused.stderr.contains("unauthenticated"), "{}", refused.stderr);
     }
-    let _ = bench.submit("out", cluster.url(), &["--token-file", &token]).wait().expect_code(0);
+    let _ = bench.submit("out", &cluster, &["--token-file", &token]).wait().expect_code(0);
 }

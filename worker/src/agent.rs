@@ -108,6 +108,7 @@ pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result
         max_wait: FIRST_WAIT,
         lease_ends: None,
         broken: None,
+        impatience: CancellationToken::new(),
     };
     agent.run(inbox, stop).await
 }
@@ -145,6 +146,8 @@ struct Agent {
     lease_ends: Option<Instant>,
     /// Why the device can do no further job.
     broken: Option<String>,
+    /// Ends the waiting for a store in trouble: a worker that goes gives its jobs back instead.
+    impatience: CancellationToken,
 }
 
 impl Agent {
@@ -244,7 +247,8 @@ impl Agent {
         let first = self.unopened.take();
         let is_first = first.is_some();
         if let Some((device, cache_bytes)) = first {
-            self.jobs = Some(Arc::new(Jobs::new(Store::open(&reply.store_url)?, device, cache_bytes)));
+            let store = Store::open(&reply.store_url)?.patient(self.impatience.clone());
+            self.jobs = Some(Arc::new(Jobs::new(store, device, cache_bytes)));
         }
         self.max_wait = reply.report_interval;
         for attempt in &reply.revoked {
@@ -322,6 +326,7 @@ impl Agent {
     fn drain(&mut self) {
         if self.state == WorkerState::Ready {
             self.state = WorkerState::Draining;
+            self.impatience.cancel();
             for attempt in self.held.not_started() {
                 self.give_up(attempt);
             }

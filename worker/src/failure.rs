@@ -86,7 +86,8 @@ impl JobError {
             Self::Device(DeviceError::Gone) => ("device-gone", true, true),
             Self::Lost { .. } => ("input-lost", true, false),
             Self::Malformed { .. } => ("input-malformed", true, true),
-            Self::Input { .. } | Self::Weights(_) => ("store-read", true, true),
+            // The store's trouble is not the job's.
+            Self::Input { .. } | Self::Weights(_) => ("store-read", true, false),
             Self::Store(_) => ("store-write", true, false),
             Self::Bands(_) => ("bands", false, true),
             Self::NoDepthMap => ("no-depth-map", false, true),

@@ -6,7 +6,7 @@
 //!                   └─> jobs (one job from grant to stored result)
 //!                         ├─ images ── device (one thread owns the network)
 //!                         ├─ cloud
-//!                         └─ store (the truth of every result) ── blob (maps as bytes)
+//!                         └─ planesweep_store (the truth of every result) ── blob (maps as bytes)
 //! ```
 //!
 //! A worker needs the coordinator's address, nothing else: where results lie, which weights to use
@@ -22,9 +22,9 @@ mod failure;
 mod held;
 mod images;
 mod jobs;
-mod store;
+
+use planesweep_store as store;
 
 pub use agent::{WorkerConfig, WorkerError, run_worker};
 pub use blob::{BlobError, decode_depth_map};
 pub use device::BackendFactory;
-pub use store::{Store, StoreError};

@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::{Context, Result};
 use clap::Args;
 use planesweep_coordinator::{Config, Coordinator};
-use planesweep_worker::Store;
+use planesweep_store::Store;
 use serde_json::json;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 

@@ -16,7 +16,8 @@ use planesweep_report::{
 use planesweep_scene::{
     Camera, Raster, Scene, SourceScore, ViewId, mvsnet_cam_text, mvsnet_pair_text, write_atomically,
 };
-use planesweep_worker::{Store, decode_depth_map};
+use planesweep_store::Store;
+use planesweep_worker::decode_depth_map;
 use rayon::prelude::*;
 use serde_json::json;
 use tokio::runtime::Runtime;

@@ -9,7 +9,7 @@ use clap::Args;
 use planesweep_coordinator::{Config, Coordinator};
 use planesweep_mvsnet::Refinement;
 use planesweep_proto::{Client, JobResult};
-use planesweep_worker::Store;
+use planesweep_store::Store;
 
 use super::export::{self, Finished};
 use crate::args::{FilterArgs, NetworkArgs, PlanArgs, ReadArgs};

@@ -43,17 +43,15 @@ pub fn run(args: &StatusArgs) -> Result<Outcome> {
     let runtime = tokio::runtime::Runtime::new().context("cannot start the runtime")?;
     runtime.block_on(async {
         let mut client = args.connect.client()?;
-        let run = match &args.run {
-            Some(run) => Some(RunId(run.clone())),
-            None => {
-                let runs = client.runs().await.context("cannot list the runs")?;
-                match runs.first() {
-                    Some(latest) if args.watch => Some(latest.run.clone()),
-                    _ => return Ok(list(&runs)),
-                }
+        let run = if let Some(run) = &args.run {
+            RunId(run.clone())
+        } else {
+            let runs = client.runs().await.context("cannot list the runs")?;
+            match runs.first() {
+                Some(latest) if args.watch => latest.run.clone(),
+                _ => return Ok(list(&runs)),
             }
         };
-        let Some(run) = run else { return Ok(list(&[])) };
         let status = if args.watch {
             watch(&client, &run).await?
         } else {

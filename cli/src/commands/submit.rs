@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use anyhow::{Context, Result};
 use clap::Args;
-use planesweep_worker::Store;
+use planesweep_store::Store;
 use serde_json::json;
 
 use super::export::{self, Finished};
@@ -53,12 +53,13 @@ pub fn run(args: &SubmitArgs, json: bool) -> Result<Outcome> {
     let begun = Instant::now();
     let mut stages = Stages::new();
     let runtime = tokio::runtime::Runtime::new().context("cannot start the runtime")?;
+    let interrupts = Interrupts::default();
     // Before anything that takes long.
     let (client, store) = runtime.block_on(async {
         let mut client = args.connect.client()?;
         let url = client.store_url().await;
         let url = url.with_context(|| format!("cannot submit to {}", args.connect.coordinator))?;
-        Ok::<_, anyhow::Error>((client, Store::open(&url)?))
+        Ok::<_, anyhow::Error>((client, Store::open(&url)?.patient(interrupts.drain.clone())))
     })?;
     if let Some(out) = &args.out {
         check_out(out, &args.scene)?;
@@ -80,7 +81,6 @@ pub fn run(args: &SubmitArgs, json: bool) -> Result<Outcome> {
     };
     let computing = Instant::now();
     let results = runtime.block_on(async {
-        let interrupts = Interrupts::default();
         interrupts.clone().listen("no longer waiting", None);
         let say_run = |run: &_| {
             eprintln!("run {run}");

@@ -1,0 +1,86 @@
+//! What can go wrong with blobs.
+
+use std::io::{self, ErrorKind};
+
+use planesweep_plan::BlobKey;
+use thiserror::Error;
+
+/// Why a blob could not be written or read.
+#[derive(Debug, Error)]
+pub enum StoreError {
+    /// The address of the store is of no kind that is understood, or nothing is there.
+    #[error("cannot open the store at {url}: {problem}")]
+    Open {
+        /// The address.
+        url: String,
+        /// What is wrong.
+        problem: String,
+    },
+    /// Writing failed.
+    #[error("cannot write blob {key} to {url}")]
+    Write {
+        /// The blob.
+        key: BlobKey,
+        /// The store.
+        url: String,
+        /// What the store said.
+        #[source]
+        source: object_store::Error,
+    },
+    /// Reading failed.
+    #[error("cannot read blob {key} from {url}")]
+    Read {
+        /// The blob.
+        key: BlobKey,
+        /// The store.
+        url: String,
+        /// What the store said.
+        #[source]
+        source: object_store::Error,
+    },
+    /// The store has no such blob.
+    #[error("blob {key} is not in the store")]
+    Missing {
+        /// The blob.
+        key: BlobKey,
+    },
+    /// The bytes are not those that were written.
+    #[error("blob {key} is damaged: its bytes have another hash or length")]
+    Damaged {
+        /// The blob.
+        key: BlobKey,
+    },
+}
+
+impl StoreError {
+    /// Whether the blob must be made again.
+    pub fn is_lost(&self) -> bool {
+        matches!(self, Self::Missing { .. } | Self::Damaged { .. })
+    }
+
+    /// Whether the same call may succeed later: the store cannot be reached, or has no room. Keys that
+    /// open nothing and folders that may not be written are for a person to mend.
+    pub fn is_passing(&self) -> bool {
+        let (Self::Write { source, .. } | Self::Read { source, .. }) = self else { return false };
+        let is_forbidden = |kind| matches!(kind, ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem);
+        matches!(source, object_store::Error::Generic { .. } | object_store::Error::JoinError { .. })
+            && !self.io_kind().is_some_and(is_forbidden)
+    }
+
+    /// Whether the disk has no room left.
+    pub fn is_disk_full(&self) -> bool {
+        self.io_kind().is_some_and(|kind| matches!(kind, ErrorKind::StorageFull | ErrorKind::QuotaExceeded))
+    }
+
+    /// What the system said, when it was the system.
+    fn io_kind(&self) -> Option<ErrorKind> {
+        let mut cause = std::error::Error::source(self);
+        while let Some(error) = cause {
+            if let Some(io) = error.downcast_ref::<io::Error>() {
+                return Some(io.kind());
+            }
+            cause = error.source();
+        }
+        None
+    }
+}

@@ -1,0 +1,56 @@
+//! Trying again while a store cannot be reached, or is full.
+
+use std::time::Duration;
+
+use tokio_util::sync::CancellationToken;
+
+use crate::StoreError;
+
+/// Pauses between tries: doubled up to the longest.
+const PAUSES: (Duration, Duration) = (Duration::from_millis(200), Duration::from_secs(5));
+
+/// Tries until the trouble is over, and says so once; the trouble itself when `impatience` is cancelled
+/// before that.
+pub(crate) async fn patiently<T, F: Future<Output = Result<T, StoreError>>>(
+    impatience: &CancellationToken,
+    attempt: impl Fn() -> F,
+) -> Result<T, StoreError> {
+    let mut pause = PAUSES.0;
+    let mut was_in_trouble = false;
+    loop {
+        let error = match attempt().await {
+            Err(error) if error.is_passing() => error,
+            done => {
+                if was_in_trouble && done.is_ok() {
+                    tracing::warn!("the store works again");
+                }
+                return done;
+            }
+        };
+        if impatience.is_cancelled() {
+            return Err(error);
+        }
+        if !was_in_trouble {
+            let what = if error.is_disk_full() { "disk full" } else { "the store does not answer" };
+            tracing::warn!("{what}, trying again until it works: {}", with_causes(&error));
+        }
+        was_in_trouble = true;
+        tokio::select! {
+            () = tokio::time::sleep(pause) => {}
+            () = impatience.cancelled() => return Err(error),
+        }
+        pause = (2 * pause).min(PAUSES.1);
+    }
+}
+
+/// An error with what caused it, outermost first.
+fn with_causes(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(inner) = cause {
+        text.push_str(": ");
+        text.push_str(&inner.to_string());
+        cause = inner.source();
+    }
+    text
+}
