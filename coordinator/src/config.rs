@@ -1,11 +1,12 @@
 //! What a coordinator is started with.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::path::PathBuf;
 use std::time::Duration;
 
 use thiserror::Error;
 use tonic::metadata::{Ascii, MetadataValue};
+
+use crate::ledger::LedgerPlace;
 
 /// Shorter leases would end between two reports on a busy host.
 const MIN_LEASE: Duration = Duration::from_millis(100);
@@ -15,8 +16,8 @@ const MAX_LEASE: Duration = Duration::from_hours(1);
 /// What a coordinator is started with.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Config {
-    /// The SQLite file; made when it is not there.
-    pub ledger: PathBuf,
+    /// What knows every job.
+    pub ledger: LedgerPlace,
     /// Where to listen; port 0 takes a free one.
     pub listen: SocketAddr,
     /// How long a worker that does not report keeps its jobs. Everything else about time is derived
@@ -52,7 +53,7 @@ pub enum ConfigError {
 
 impl Config {
     /// The defaults: a free port of the loopback interface, leases of 7 s, no token.
-    pub fn new(ledger: impl Into<PathBuf>, store_url: impl Into<String>) -> Self {
+    pub fn new(ledger: impl Into<LedgerPlace>, store_url: impl Into<String>) -> Self {
         Self {
             ledger: ledger.into(),
             listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0),

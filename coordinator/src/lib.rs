@@ -19,5 +19,5 @@ mod server;
 mod service;
 
 pub use config::{Config, ConfigError};
-pub use ledger::{Ledger, LedgerError};
+pub use ledger::{Ledger, LedgerError, LedgerPlace};
 pub use server::{Coordinator, Handle, StartError};

@@ -213,6 +213,8 @@ enum Step {
         job: prop::sample::Index,
     },
     Restart,
+    /// From now on the other coordinator of the same ledger is the one that is spoken to.
+    Switch,
 }
 
 fn step() -> impl Strategy<Value = Step> {
@@ -232,12 +234,17 @@ fn step() -> impl Strategy<Value = Step> {
         1 => (1..5_usize).prop_map(|views| Step::Cancel { views }),
         1 => any::<prop::sample::Index>().prop_map(|job| Step::Lose { job }),
         1 => Just(Step::Restart),
+        2 => Just(Step::Switch),
     ]
 }
 
 struct World {
     ledger: Ledger,
     snapshot: Snapshot,
+    /// What another coordinator knew when it was last spoken to.
+    other: Snapshot,
+    /// When the leases end that the ledger has.
+    deadlines: BTreeMap<JobId, Timestamp>,
     now: Timestamp,
     workers: Vec<Worker>,
     born: usize,
@@ -250,6 +257,8 @@ impl World {
         let mut world = Self {
             ledger: Ledger::default(),
             snapshot: Snapshot::new(LEASE_MS, [], Timestamp(0)),
+            other: Snapshot::new(LEASE_MS, [], Timestamp(0)),
+            deadlines: BTreeMap::new(),
             now: Timestamp(0),
             workers: Vec::new(),
             born: 0,
@@ -273,6 +282,9 @@ impl World {
         for command in &commands {
             let changed = self.ledger.execute(command);
             assert_eq!(self.snapshot.apply(command, self.now), changed, "{command:?}");
+            if let Command::Grant { job, deadline, .. } | Command::Renew { job, deadline, .. } = command {
+                self.deadlines.insert(*job, *deadline);
+            }
         }
         self.check();
         commands
@@ -376,6 +388,14 @@ impl World {
             Step::Restart => {
                 self.now = self.now.plus(10);
                 self.snapshot = Snapshot::new(LEASE_MS, self.ledger.records(), self.now);
+                self.check();
+            }
+            Step::Switch => {
+                std::mem::swap(&mut self.snapshot, &mut self.other);
+                for record in self.ledger.records() {
+                    let deadline = self.deadlines.get(&record.shape.id).copied();
+                    assert!(self.snapshot.observe(record, deadline, self.now));
+                }
                 self.check();
             }
         }

@@ -1,7 +1,6 @@
 //! `planesweep coordinator`.
 
 use std::net::SocketAddr;
-use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Context, Result};
@@ -26,9 +25,10 @@ pub struct CoordinatorArgs {
     /// Where to listen; other hosts are let in with a token only. Port 0 takes a free one.
     #[arg(long, env = "PLANESWEEP_LISTEN", default_value = "127.0.0.1:7070", value_name = "ADDRESS")]
     pub listen: SocketAddr,
-    /// The SQLite file that knows every job; made when it is not there.
-    #[arg(long, env = "PLANESWEEP_LEDGER", value_name = "FILE")]
-    pub ledger: PathBuf,
+    /// What knows every job: an SQLite file, made when it is not there, or a database that several
+    /// coordinators share, postgres://user:password@host/database.
+    #[arg(long, env = "PLANESWEEP_LEDGER", hide_env_values = true, value_name = "FILE|URL")]
+    pub ledger: String,
     /// Where results lie: a folder that all workers reach under this path, or its file:// address.
     #[arg(long, env = "PLANESWEEP_STORE", value_name = "URL", value_parser = store_url)]
     pub store: String,
@@ -46,7 +46,7 @@ pub fn run(args: &CoordinatorArgs) -> Result<Outcome> {
         listen: args.listen,
         lease: args.lease,
         token: args.token.read()?,
-        ..Config::new(&args.ledger, store.url())
+        ..Config::new(&*args.ledger, store.url())
     };
     let runtime = tokio::runtime::Runtime::new().context("cannot start the runtime")?;
     let url = runtime.block_on(serve(config))?;

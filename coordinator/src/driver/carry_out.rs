@@ -7,7 +7,7 @@ use planesweep_proto::{Failure, Outcome, Produced, Success};
 
 use super::Driver;
 use crate::ledger::{LedgerError, Step};
-use crate::schedule::{Command, Timestamp};
+use crate::schedule::{Command, Event, Timestamp, decide};
 
 /// What the statements write beyond the commands.
 #[derive(Default)]
@@ -43,29 +43,24 @@ impl Payload<'_> {
 }
 
 impl Driver {
-    /// Carries out commands as a step of their own.
+    /// Carries out what follows from an event as a step of its own; says how much changed.
     pub(super) async fn carry_out_alone(
         &mut self,
-        commands: &[Command],
+        event: Event,
         now: Timestamp,
-    ) -> Result<(), planesweep_proto::ServiceError> {
-        match self.try_alone(commands, now).await {
-            Ok(()) => Ok(()),
+    ) -> Result<usize, planesweep_proto::ServiceError> {
+        match self.try_alone(event, now).await {
+            Ok(changed) => Ok(changed),
             Err(error) => Err(self.recover(&error).await),
         }
     }
 
-    async fn try_alone(&mut self, commands: &[Command], now: Timestamp) -> Result<(), LedgerError> {
-        let mut step = self.ledger.begin().await?;
-        self.carry_out(&mut step, commands, &Payload::default(), now).await?;
-        self.commit(step).await
-    }
-
-    /// Makes a step durable and wakes those who wait for changes.
-    pub(super) async fn commit(&mut self, step: Step) -> Result<(), LedgerError> {
-        step.commit().await?;
-        self.changes.send_modify(|changes| *changes += 1);
-        Ok(())
+    async fn try_alone(&mut self, event: Event, now: Timestamp) -> Result<usize, LedgerError> {
+        let mut step = self.begin(now).await?;
+        let commands = decide(&self.snapshot, event, now);
+        let changed = self.carry_out(&mut step, &commands, &Payload::default(), now).await?.len();
+        self.commit(step).await?;
+        Ok(changed)
     }
 
     /// Carries out commands within a step; returns those that changed something.
@@ -83,7 +78,7 @@ impl Driver {
                 continue;
             }
             if !self.snapshot.apply(command, now) {
-                // Cannot be: the snapshot follows the ledger, and this loop alone changes it.
+                // Cannot be: the snapshot is the ledger's at this step.
                 tracing::error!(?command, "the ledger and the snapshot disagree");
             }
             self.note(command, payload);

@@ -1,14 +1,16 @@
 //! The one loop: takes messages, reads the clock, has decisions made and carries them out.
 //!
-//! Nothing else reads the clock, and nobody else changes the ledger while a coordinator runs. Each
-//! message is one step of the ledger: decided on the snapshot, committed, then answered. When the
-//! ledger fails, the snapshot is read anew from it and the caller may ask again.
+//! Nothing else reads the clock. Each message is one step of the ledger: decided on the snapshot,
+//! committed, then answered. What other coordinators did in a ledger that is shared is taken over
+//! before each decision (`shared`). When the ledger fails, the snapshot is read anew from it and the
+//! caller may ask again.
 
 mod carry_out;
 mod message;
 mod repeats;
 mod report;
 mod runs;
+mod shared;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -23,7 +25,7 @@ use tokio_util::sync::CancellationToken;
 pub(crate) use message::{DriverHandle, Fleet, Message};
 use report::Parked;
 
-use crate::ledger::{Ledger, LedgerError};
+use crate::ledger::{Change, Changes, Ledger, LedgerError};
 use crate::schedule::{Event, Snapshot, Timestamp, decide};
 
 /// Messages that may wait for the loop; senders beyond wait themselves.
@@ -37,6 +39,13 @@ pub(crate) struct Settings {
     pub lease: Duration,
     pub report_interval: Duration,
     pub store_url: String,
+}
+
+impl Settings {
+    /// How often the loop looks what time alone brought.
+    fn tick(&self) -> Duration {
+        (self.lease / 16).max(Duration::from_millis(5))
+    }
 }
 
 /// What is known of a worker beside its jobs.
@@ -55,6 +64,8 @@ pub(crate) struct Driver {
     settings: Settings,
     snapshot: Snapshot,
     results: BTreeMap<JobId, Produced>,
+    /// The step of the ledger that the snapshot stands at; `None` while it must be read anew.
+    seen: Option<i64>,
     /// The loop's clock starts here.
     epoch: Instant,
     workers: BTreeMap<WorkerId, WorkerInfo>,
@@ -68,6 +79,8 @@ pub(crate) struct Driver {
     divergent_results: u64,
     /// Rises with every change of a job, for those who wait for a run's end.
     changes: watch::Sender<u64>,
+    /// When the loop last had time for a tick.
+    ticked: Timestamp,
 }
 
 impl Driver {
@@ -78,7 +91,7 @@ impl Driver {
         closed: CancellationToken,
     ) -> Result<(DriverHandle, tokio::task::JoinHandle<()>), LedgerError> {
         let epoch = Instant::now();
-        let (snapshot, results) = read(&ledger, settings.lease, Timestamp(0)).await?;
+        let (snapshot, results, seen) = read(&ledger, settings.lease, Timestamp(0)).await?;
         let (messages, inbox) = mpsc::channel(QUEUE);
         let (changes, changed) = watch::channel(0);
         let driver = Self {
@@ -86,6 +99,7 @@ impl Driver {
             settings,
             snapshot,
             results,
+            seen: Some(seen),
             epoch,
             workers: BTreeMap::new(),
             parked: BTreeMap::new(),
@@ -95,13 +109,14 @@ impl Driver {
             late_results: 0,
             divergent_results: 0,
             changes,
+            ticked: Timestamp(0),
         };
         let task = tokio::spawn(driver.run(inbox, closed));
         Ok((DriverHandle { messages, changed }, task))
     }
 
     async fn run(mut self, mut inbox: mpsc::Receiver<Message>, closed: CancellationToken) {
-        let mut ticks = tokio::time::interval((self.settings.lease / 16).max(Duration::from_millis(5)));
+        let mut ticks = tokio::time::interval(self.settings.tick());
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
@@ -151,15 +166,28 @@ impl Driver {
 
     async fn tick(&mut self) {
         let now = self.now();
-        let commands = decide(&self.snapshot, Event::Tick, now);
-        if !commands.is_empty() && self.carry_out_alone(&commands, now).await.is_ok() {
+        // A process that stood still, or was busy with one large step, heard no reports; that nobody
+        // reported to it means nothing.
+        let stood_still = now.0.saturating_sub(self.ticked.0);
+        if stood_still > self.settings.lease.as_millis() as u64 / 4 {
+            self.snapshot.prolong(stood_still);
+        }
+        self.ticked = now;
+        if let Err(error) = self.catch_up().await {
+            tracing::warn!(error = describe(&error), "the ledger does not answer");
+            self.seen = None;
+            return;
+        }
+        if decide(&self.snapshot, Event::Tick, now).is_empty()
+            || self.carry_out_alone(Event::Tick, now).await.is_ok()
+        {
             self.note_workers(now);
         }
     }
 
     /// Keeps account of since when there is no worker.
     fn note_workers(&mut self, now: Timestamp) {
-        if self.snapshot.alive() > 0 {
+        if self.snapshot.has_holder() {
             self.without_worker_since = None;
         } else if self.without_worker_since.is_none() {
             self.without_worker_since = Some(now);
@@ -180,11 +208,9 @@ impl Driver {
     async fn recover(&mut self, error: &LedgerError) -> ServiceError {
         let text = describe(error);
         tracing::error!(error = text, "the ledger failed; it is read anew");
-        match read(&self.ledger, self.settings.lease, self.now()).await {
-            Ok((snapshot, results)) => (self.snapshot, self.results) = (snapshot, results),
-            Err(error) => {
-                tracing::error!(error = describe(&error), "the ledger cannot be read");
-            }
+        self.seen = None;
+        if let Err(error) = self.catch_up().await {
+            tracing::error!(error = describe(&error), "the ledger cannot be read");
         }
         ServiceError::new(Code::Internal, text)
     }
@@ -219,9 +245,15 @@ async fn read(
     ledger: &Ledger,
     lease: Duration,
     now: Timestamp,
-) -> Result<(Snapshot, BTreeMap<JobId, Produced>), LedgerError> {
-    let snapshot = Snapshot::new(lease.as_millis() as u64, ledger.load().await?, now);
-    Ok((snapshot, ledger.load_results().await?.into_iter().collect()))
+) -> Result<(Snapshot, BTreeMap<JobId, Produced>, i64), LedgerError> {
+    let Changes { step, jobs } = ledger.load(now).await?;
+    let mut results = BTreeMap::new();
+    let records = jobs.into_iter().map(|Change { record, produced, .. }| {
+        results.extend(produced.map(|produced| (record.shape.id, produced)));
+        record
+    });
+    let snapshot = Snapshot::new(lease.as_millis() as u64, records, now);
+    Ok((snapshot, results, step))
 }
 
 /// An error with its causes, in one line.

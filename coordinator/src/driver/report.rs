@@ -89,31 +89,26 @@ impl Driver {
         };
         let outcomes = report.finished.iter().map(|f| ((f.job, f.attempt), &f.outcome)).collect();
         let payload = Payload { outcomes, ..Payload::default() };
-        let commands = decide(&self.snapshot, event, now);
         let wants = Event::WantsWork { worker: report.worker.clone(), free: slots(report) };
-
-        let mut answer = self.empty_answer(report.offset_ms);
-        for command in &commands {
-            match *command {
-                Command::Revoke { job, attempt } => answer.revoked.push(JobAttempt { job, attempt }),
-                Command::Acknowledge { job, attempt } => {
-                    answer.acknowledged.push(JobAttempt { job, attempt });
-                }
-                _ => {}
-            }
+        if self.seen.is_none() {
+            self.catch_up().await?;
         }
         // A heartbeat with nothing in hand and nothing to be had costs the ledger nothing.
+        let commands = decide(&self.snapshot, event.clone(), now);
         if commands.iter().all(|command| matches!(command, Command::Admit { .. })) {
             for command in &commands {
                 self.snapshot.apply(command, now);
             }
+            let mut answer = self.answer(report.offset_ms, &[]);
             if self.order == Order::Work {
                 answer.grants = self.grant_alone(wants, now).await?;
             }
             return Ok(answer);
         }
-        let mut step = self.ledger.begin().await?;
+        let mut step = self.begin(now).await?;
+        let commands = decide(&self.snapshot, event, now);
         self.carry_out(&mut step, &commands, &payload, now).await?;
+        let mut answer = self.answer(report.offset_ms, &commands);
         if self.order == Order::Work {
             answer.grants = self.grant(&mut step, wants, now).await?;
         }
@@ -208,7 +203,7 @@ impl Driver {
         if decide(&self.snapshot, wants.clone(), now).is_empty() {
             return Ok(Vec::new());
         }
-        let mut step = self.ledger.begin().await?;
+        let mut step = self.begin(now).await?;
         let grants = self.grant(&mut step, wants, now).await?;
         self.commit(step).await?;
         Ok(grants)
@@ -229,14 +224,23 @@ impl Driver {
         let _ = reply.send(Ok(answer));
     }
 
-    fn empty_answer(&self, offset_ms: u64) -> ReportReply {
+    /// What the worker is told of the commands that followed from its report.
+    fn answer(&self, offset_ms: u64, commands: &[Command]) -> ReportReply {
+        let revoked = |command: &Command| match *command {
+            Command::Revoke { job, attempt } => Some(JobAttempt { job, attempt }),
+            _ => None,
+        };
+        let acknowledged = |command: &Command| match *command {
+            Command::Acknowledge { job, attempt } => Some(JobAttempt { job, attempt }),
+            _ => None,
+        };
         ReportReply {
             offset_ms,
             lease: self.settings.lease,
             report_interval: self.settings.report_interval,
             grants: Vec::new(),
-            revoked: Vec::new(),
-            acknowledged: Vec::new(),
+            revoked: commands.iter().filter_map(revoked).collect(),
+            acknowledged: commands.iter().filter_map(acknowledged).collect(),
             store_url: self.settings.store_url.clone(),
             order: self.order,
         }

@@ -35,7 +35,7 @@ impl Driver {
         let now = self.now();
         let by_id: BTreeMap<JobId, &Job> = jobs.iter().map(|job| (job.id, job)).collect();
         let payload = Payload { jobs: by_id, ..Payload::default() };
-        let mut step = self.ledger.begin().await?;
+        let mut step = self.begin(now).await?;
         let lost = Event::ResultsLost { jobs: header.missing_results.clone() };
         let commands = decide(&self.snapshot, lost, now);
         self.carry_out(&mut step, &commands, &payload, now).await?;
@@ -75,7 +75,7 @@ impl Driver {
 
     async fn try_cancel(&mut self, run: &RunId) -> Result<(), LedgerError> {
         let now = self.now();
-        let mut step = self.ledger.begin().await?;
+        let mut step = self.begin(now).await?;
         step.cancel_run(run).await?;
         let unwanted = Event::Cancelled { jobs: step.unwanted().await? };
         let commands = decide(&self.snapshot, unwanted, now);
@@ -85,10 +85,7 @@ impl Driver {
 
     /// Makes done jobs run again; says how many there were.
     pub(super) async fn forget_results(&mut self, jobs: Vec<JobId>) -> Result<usize, ServiceError> {
-        let now = self.now();
-        let commands = decide(&self.snapshot, Event::ResultsLost { jobs }, now);
-        self.carry_out_alone(&commands, now).await?;
-        Ok(commands.len())
+        self.carry_out_alone(Event::ResultsLost { jobs }, self.now()).await
     }
 }
 

@@ -1,43 +1,44 @@
 //! What can go wrong with the ledger.
 
 use std::io;
-use std::path::PathBuf;
 
 use planesweep_plan::RunId;
 use thiserror::Error;
+
+use super::LedgerPlace;
 
 /// Why the ledger could not be read or changed.
 #[derive(Debug, Error)]
 pub enum LedgerError {
     /// The lock file could not be made.
-    #[error("could not lock the ledger {}", path.display())]
+    #[error("could not lock the ledger {ledger}")]
     Lock {
         /// The ledger.
-        path: PathBuf,
+        ledger: LedgerPlace,
         /// Why.
         #[source]
         source: io::Error,
     },
     /// Another process has it.
-    #[error("the ledger {} is in use by another coordinator; stop it or choose another output folder", path.display())]
+    #[error("the ledger {ledger} is in use by another coordinator; stop it or choose another")]
     InUse {
         /// The ledger.
-        path: PathBuf,
+        ledger: LedgerPlace,
     },
-    /// The file could not be opened as a database.
-    #[error("could not open the ledger {}", path.display())]
+    /// The file could not be opened as a database, or the server not be reached.
+    #[error("could not open the ledger {ledger}")]
     Open {
         /// The ledger.
-        path: PathBuf,
+        ledger: LedgerPlace,
         /// Why.
         #[source]
         source: sqlx::Error,
     },
     /// It was made by another version.
-    #[error("the ledger {} has schema {found}, this version reads {expected}", path.display())]
+    #[error("the ledger {ledger} has schema {found}, this version reads {expected}")]
     Schema {
         /// The ledger.
-        path: PathBuf,
+        ledger: LedgerPlace,
         /// What it has.
         found: i64,
         /// What is understood.

@@ -5,70 +5,129 @@
 //! | `schema` | the tables |
 //! | `step` | submit, claim, renew, complete, fail, sweep: conditional, in one transaction |
 //! | `query` | what clients ask: status, failures, results |
+//! | `rows` | what coordinators read: all jobs at the start, later those that others changed |
 //!
 //! A step is durable once it is committed: the process may be killed at any moment, and
-//! the next one finds either all of a step or nothing of it. Placeholders and types are those that
-//! SQLite and PostgreSQL share.
+//! the next one finds either all of a step or nothing of it. The statements are the same for SQLite
+//! and PostgreSQL, but for the beginning of a step and for the claim.
+//!
+//! **Several coordinators** may share a PostgreSQL ledger. Steps have numbers without gaps, and taking
+//! the next number is taking the right to write, so steps come one after the other. A coordinator that
+//! gets a number that does not follow its own last one reads what was changed in between before it
+//! decides; so each decides on the truth, and a statement that changes no row is one that somebody was
+//! faster with. One that freezes within a step is cut off by the server.
 
 mod error;
+mod place;
 mod query;
+mod rows;
 mod schema;
 mod step;
 
 use std::fs::{File, TryLockError};
 use std::path::Path;
+use std::str::FromStr;
+use std::time::Duration;
 
 use planesweep_plan::JobId;
-use planesweep_proto::Produced;
-use sqlx::SqlitePool;
-use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
+use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
+use sqlx::{AnyPool, Executor};
+use url::Url;
 
 pub use error::LedgerError;
+pub use place::LedgerPlace;
+pub(crate) use rows::{Change, Changes};
 pub(crate) use step::Step;
 
-use crate::schedule::{JobRecord, Reopening};
+use crate::schedule::{Reopening, Timestamp};
+
+/// How long a statement waits for a connection; whoever asked may ask again.
+const CONNECTING: Duration = Duration::from_secs(4);
 
 /// The jobs, attempts, leases and results of all runs.
 #[derive(Debug)]
 pub struct Ledger {
-    pool: SqlitePool,
+    pool: AnyPool,
+    kind: Kind,
     /// Held for as long as the ledger is open: two coordinators on one SQLite file would each
-    /// decide on a picture that the other one changes.
-    _lock: File,
+    /// renew leases by a clock of their own.
+    _lock: Option<File>,
+}
+
+/// Which database it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Kind {
+    Sqlite,
+    Postgres,
+}
+
+impl Kind {
+    /// How a transaction begins.
+    fn begin(self) -> &'static str {
+        match self {
+            // Immediate: the right to write is taken now, so no statement fails for the lack of it.
+            Self::Sqlite => "BEGIN IMMEDIATE",
+            Self::Postgres => "BEGIN",
+        }
+    }
+
+    /// What each connection is told first.
+    fn settings(self) -> &'static str {
+        match self {
+            // In WAL mode, anything less than full may lose the last commits when the power fails.
+            Self::Sqlite => "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL",
+            // A coordinator that freezes within a step must not keep the others out.
+            Self::Postgres => "SET idle_in_transaction_session_timeout = '10s'",
+        }
+    }
 }
 
 impl Ledger {
-    /// Opens the ledger in this file, or makes it. Only one process can have it open.
-    pub async fn open(path: &Path) -> Result<Self, LedgerError> {
-        let lock = lock(path)?;
-        let options = SqliteConnectOptions::new()
-            .filename(path)
-            .create_if_missing(true)
-            .journal_mode(SqliteJournalMode::Wal)
-            // In WAL mode, anything less may lose the last commits when the power fails.
-            .synchronous(SqliteSynchronous::Full);
-        let pool = SqlitePoolOptions::new()
+    /// Opens the ledger, or makes it. Only one process can have a file open; a PostgreSQL may be shared.
+    pub async fn open(place: &LedgerPlace) -> Result<Self, LedgerError> {
+        sqlx::any::install_default_drivers();
+        let failed = |source| LedgerError::Open { ledger: place.clone(), source };
+        let (kind, url, lock) = match place {
+            LedgerPlace::File(path) => (Kind::Sqlite, sqlite_url(path), Some(lock(path)?)),
+            LedgerPlace::Postgres(url) => (Kind::Postgres, url.clone(), None),
+        };
+        let options = AnyConnectOptions::from_str(&url).map_err(failed)?;
+        let pool = AnyPoolOptions::new()
             .max_connections(4)
+            .acquire_timeout(CONNECTING)
+            .after_connect(move |connection, _| {
+                Box::pin(async move {
+                    connection.execute(sqlx::raw_sql(kind.settings())).await?;
+                    Ok(())
+                })
+            })
             .connect_with(options)
             .await
-            .map_err(|source| LedgerError::Open { path: path.to_owned(), source })?;
-        schema::create(&pool, path).await?;
-        Ok(Self { pool, _lock: lock })
+            .map_err(failed)?;
+        schema::create(&pool, kind, place).await?;
+        Ok(Self { pool, kind, _lock: lock })
+    }
+
+    /// Whether other coordinators may change it, too.
+    pub(crate) fn is_shared(&self) -> bool {
+        self.kind == Kind::Postgres
     }
 
     /// Begins to change the ledger.
-    pub(crate) async fn begin(&self) -> Result<Step, LedgerError> {
-        Step::begin(&self.pool).await
+    pub(crate) async fn begin(&self, now: Timestamp) -> Result<Step, LedgerError> {
+        Step::begin(&self.pool, self.kind, now).await
     }
 
-    /// Every job, in plan order.
-    pub(crate) async fn load(&self) -> Result<Vec<JobRecord>, LedgerError> {
-        query::records(&self.pool).await
+    /// Every job, in plan order, as of the latest step.
+    pub(crate) async fn load(&self, now: Timestamp) -> Result<Changes, LedgerError> {
+        self.changes(-1, now).await
     }
 
-    /// The result of every job that is done.
-    pub(crate) async fn load_results(&self) -> Result<Vec<(JobId, Produced)>, LedgerError> {
-        query::produced(&self.pool).await
+    /// What changed after a step. What another coordinator is just changing may be left out or be in it;
+    /// then it is in the next changes, too.
+    pub(crate) async fn changes(&self, after: i64, now: Timestamp) -> Result<Changes, LedgerError> {
+        let mut connection = self.pool.acquire().await.map_err(LedgerError::statement("reach the ledger"))?;
+        rows::changes(&mut connection, self.kind, after, now).await
     }
 
     /// Makes done jobs run again whose results are no longer in the store; says how many there were.
@@ -76,7 +135,7 @@ impl Ledger {
     /// For a ledger without a coordinator; a running one is told with
     /// [`crate::Handle::forget_results`] or with the submission.
     pub async fn forget_results(&self, jobs: &[JobId]) -> Result<usize, LedgerError> {
-        let mut step = self.begin().await?;
+        let mut step = self.begin(Timestamp::default()).await?;
         let mut forgotten = 0;
         for job in jobs {
             forgotten += usize::from(step.reopen(job, Reopening::ResultLost).await?);
@@ -85,20 +144,26 @@ impl Ledger {
         Ok(forgotten)
     }
 
-    /// Closes the file; what was committed stays.
+    /// Closes the ledger; what was committed stays.
     pub async fn close(self) {
         self.pool.close().await;
     }
 }
 
+fn sqlite_url(path: &Path) -> String {
+    let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    let encoded = Url::from_file_path(&absolute).map(|url| url.path().to_owned());
+    format!("sqlite://{}?mode=rwc", encoded.unwrap_or_else(|()| absolute.display().to_string()))
+}
+
 fn lock(path: &Path) -> Result<File, LedgerError> {
     let mut name = path.as_os_str().to_owned();
     name.push(".lock");
-    let failed = |source| LedgerError::Lock { path: path.to_owned(), source };
+    let failed = |source| LedgerError::Lock { ledger: path.into(), source };
     let file = File::options().create(true).write(true).truncate(false).open(&name).map_err(failed)?;
     match file.try_lock() {
         Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => Err(LedgerError::InUse { path: path.to_owned() }),
+        Err(TryLockError::WouldBlock) => Err(LedgerError::InUse { ledger: path.into() }),
         Err(TryLockError::Error(source)) => Err(failed(source)),
     }
 }

@@ -3,13 +3,12 @@
 use std::collections::BTreeMap;
 
 use planesweep_plan::{Attempt, BlobKey, JobId, RunId, WorkerId};
-use planesweep_proto::{JobResult, JobState, Produced, RunSummary};
+use planesweep_proto::{JobResult, JobState, RunSummary};
 use planesweep_scene::ViewId;
-use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqlitePool};
+use sqlx::Row;
+use sqlx::any::AnyRow;
 
 use super::{Ledger, LedgerError};
-use crate::schedule::{Class, JobRecord, JobShape, LedgerState};
 
 /// Failures and ended jobs listed in one status.
 const LISTED: i64 = 500;
@@ -85,7 +84,7 @@ impl Ledger {
 
     /// The latest runs, newest first.
     pub(crate) async fn runs(&self) -> Result<Vec<RunSummary>, LedgerError> {
-        let rows: Vec<(i64, String, String, bool)> =
+        let rows: Vec<(i64, String, String, i64)> =
             sqlx::query_as("SELECT number, id, name, cancelled FROM runs ORDER BY number DESC LIMIT $1")
                 .bind(LISTED_RUNS)
                 .fetch_all(&self.pool)
@@ -101,7 +100,7 @@ impl Ledger {
             runs.push(RunSummary {
                 run: RunId(id),
                 name,
-                cancelled,
+                cancelled: cancelled != 0,
                 jobs: of(None),
                 done: of(Some(JobState::Done)),
                 failed: of(Some(JobState::Failed)),
@@ -131,79 +130,27 @@ impl Ledger {
     pub(crate) async fn is_finished(&self, run: &RunId) -> Result<bool, LedgerError> {
         let (number, _, cancelled) = self.find(run).await?;
         // Starts from the jobs to be done, so that it is quick at the end, when it is asked most.
-        let unfinished: bool = sqlx::query_scalar(
-            "SELECT EXISTS (SELECT 1 FROM jobs JOIN run_jobs ON run_jobs.job = jobs.position
-                            WHERE state IN ('open', 'leased') AND run = $1)",
+        let unfinished: i64 = sqlx::query_scalar(
+            "SELECT COUNT(*) FROM (SELECT 1 FROM jobs JOIN run_jobs ON run_jobs.job = jobs.position
+                                   WHERE state IN ('open', 'leased') AND run = $1 LIMIT 1) AS unfinished",
         )
         .bind(number)
         .fetch_one(&self.pool)
         .await
         .map_err(LedgerError::statement("look for unfinished jobs"))?;
-        Ok(cancelled || !unfinished)
+        Ok(cancelled || unfinished == 0)
     }
 
     async fn find(&self, run: &RunId) -> Result<(i64, String, bool), LedgerError> {
-        sqlx::query_as("SELECT number, name, cancelled FROM runs WHERE id = $1")
-            .bind(&run.0)
-            .fetch_optional(&self.pool)
-            .await
-            .map_err(LedgerError::statement("find a run"))?
-            .ok_or_else(|| LedgerError::NoSuchRun { run: run.clone() })
+        let query = sqlx::query_as("SELECT number, name, cancelled FROM runs WHERE id = $1").bind(&run.0);
+        let found: Option<(i64, String, i64)> =
+            query.fetch_optional(&self.pool).await.map_err(LedgerError::statement("find a run"))?;
+        let (number, name, cancelled) = found.ok_or_else(|| LedgerError::NoSuchRun { run: run.clone() })?;
+        Ok((number, name, cancelled != 0))
     }
 }
 
-pub(super) async fn records(pool: &SqlitePool) -> Result<Vec<JobRecord>, LedgerError> {
-    let rows = sqlx::query(
-        "SELECT id, kind, needs, state, worker, attempt, failures, losses, suspect, deaths_alone, outdated
-         FROM jobs ORDER BY position",
-    )
-    .fetch_all(pool)
-    .await
-    .map_err(LedgerError::statement("load jobs"))?;
-    rows.iter().map(record).collect()
-}
-
-fn record(row: &SqliteRow) -> Result<JobRecord, LedgerError> {
-    let kind: String = get(row, "kind")?;
-    let needs: Vec<u8> = get(row, "needs")?;
-    let needs = needs.chunks(32).map(|hash| job_id(hash.to_vec())).collect::<Result<_, _>>()?;
-    let state = match state(row)? {
-        JobState::Open => LedgerState::Open,
-        JobState::Leased => LedgerState::Leased(WorkerId(get(row, "worker")?)),
-        JobState::Done => LedgerState::Done,
-        JobState::Failed => LedgerState::Failed,
-        JobState::Cancelled => LedgerState::Cancelled,
-    };
-    Ok(JobRecord {
-        shape: JobShape { id: job_id(get(row, "id")?)?, class: Class::of(&kind), needs },
-        state,
-        attempt: Attempt(get(row, "attempt")?),
-        failures: get(row, "failures")?,
-        losses: get(row, "losses")?,
-        suspect: get(row, "suspect")?,
-        deaths_alone: get(row, "deaths_alone")?,
-        outdated: get(row, "outdated")?,
-    })
-}
-
-pub(super) async fn produced(pool: &SqlitePool) -> Result<Vec<(JobId, Produced)>, LedgerError> {
-    let rows = sqlx::query("SELECT id, blob, blob_length, worker FROM jobs WHERE state = 'done'")
-        .fetch_all(pool)
-        .await
-        .map_err(LedgerError::statement("load results"))?;
-    rows.iter()
-        .map(|row| {
-            let (blob, length): (Vec<u8>, i64) = (get(row, "blob")?, get(row, "blob_length")?);
-            let worker = WorkerId(get(row, "worker")?);
-            Ok((
-                job_id(get(row, "id")?)?,
-                Produced { blob: BlobKey(hash("blob", blob)?), length: length as u64, worker },
-            ))
-        })
-        .collect()
-}
-
-fn result(row: &SqliteRow) -> Result<JobResult, LedgerError> {
+fn result(row: &AnyRow) -> Result<JobResult, LedgerError> {
     let view: Option<i64> = get(row, "view")?;
     let blob: Option<Vec<u8>> = get(row, "blob")?;
     let length: Option<i64> = get(row, "blob_length")?;
@@ -226,7 +173,7 @@ fn result(row: &SqliteRow) -> Result<JobResult, LedgerError> {
         kind: get(row, "kind")?,
         view: view.map(|id| ViewId(id as u32)),
         state: state(row)?,
-        attempt: Attempt(get(row, "attempt")?),
+        attempt: Attempt(number(row, "attempt")?),
         ended: ended as u64,
         blob,
         measurements,
@@ -236,14 +183,24 @@ fn result(row: &SqliteRow) -> Result<JobResult, LedgerError> {
     })
 }
 
-fn get<'r, T>(row: &'r SqliteRow, column: &str) -> Result<T, LedgerError>
+pub(super) fn get<'r, T>(row: &'r AnyRow, column: &str) -> Result<T, LedgerError>
 where
-    T: sqlx::Decode<'r, sqlx::Sqlite> + sqlx::Type<sqlx::Sqlite>,
+    T: sqlx::Decode<'r, sqlx::Any> + sqlx::Type<sqlx::Any>,
 {
     row.try_get(column).map_err(LedgerError::statement("read a column"))
 }
 
-fn state(row: &SqliteRow) -> Result<JobState, LedgerError> {
+/// A count that is never large or negative.
+pub(super) fn number(row: &AnyRow, column: &'static str) -> Result<u32, LedgerError> {
+    let number: i64 = get(row, column)?;
+    u32::try_from(number).map_err(|_| LedgerError::Damaged { what: column, found: number.to_string() })
+}
+
+pub(super) fn flag(row: &AnyRow, column: &str) -> Result<bool, LedgerError> {
+    get::<i64>(row, column).map(|flag| flag != 0)
+}
+
+pub(super) fn state(row: &AnyRow) -> Result<JobState, LedgerError> {
     let name: String = get(row, "state")?;
     JobState::from_name(&name).ok_or(LedgerError::Damaged { what: "state", found: name })
 }
@@ -252,7 +209,7 @@ pub(super) fn job_id(bytes: Vec<u8>) -> Result<JobId, LedgerError> {
     hash("id", bytes).map(JobId)
 }
 
-fn hash(what: &'static str, bytes: Vec<u8>) -> Result<[u8; 32], LedgerError> {
+pub(super) fn hash(what: &'static str, bytes: Vec<u8>) -> Result<[u8; 32], LedgerError> {
     bytes.try_into().map_err(|bytes: Vec<u8>| LedgerError::Damaged {
         what,
         found: format!("{} bytes instead of 32", bytes.len()),

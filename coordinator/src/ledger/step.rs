@@ -4,11 +4,12 @@
 use planesweep_plan::{Attempt, Job, JobId, RunId, WorkerId};
 use planesweep_proto::{Failure, Success, decode_job, encode_job};
 use planesweep_scene::ViewId;
+use sqlx::any::{AnyArguments, AnyQueryResult};
 use sqlx::query::Query;
-use sqlx::sqlite::{SqliteArguments, SqliteQueryResult};
-use sqlx::{Sqlite, SqlitePool, Transaction};
+use sqlx::{Any, AnyPool, Transaction};
 
-use super::LedgerError;
+use super::rows::{self, Change};
+use super::{Kind, LedgerError};
 use crate::schedule::{Reopening, Timestamp};
 
 /// Bytes of a run's name that go into its id.
@@ -17,15 +18,43 @@ const RUN_ID_NAME_BYTES: usize = 200;
 /// A transaction; dropped without [`Step::commit`], it changes nothing.
 #[derive(Debug)]
 pub struct Step {
-    transaction: Transaction<'static, Sqlite>,
+    transaction: Transaction<'static, Any>,
+    kind: Kind,
+    number: i64,
+    /// The same moment by the clocks of the driver and of the ledger.
+    now: (Timestamp, i64),
 }
 
 impl Step {
-    pub(super) async fn begin(pool: &SqlitePool) -> Result<Self, LedgerError> {
-        // Immediate: the right to write is taken now, so no statement fails for the lack of it.
-        let transaction =
-            pool.begin_with("BEGIN IMMEDIATE").await.map_err(LedgerError::statement("begin a step"))?;
-        Ok(Self { transaction })
+    /// Begins the next step; waits while another coordinator is within one.
+    pub(super) async fn begin(pool: &AnyPool, kind: Kind, now: Timestamp) -> Result<Self, LedgerError> {
+        let failed = LedgerError::statement("begin a step");
+        let mut transaction = pool.begin_with(kind.begin()).await.map_err(&failed)?;
+        let next = match kind {
+            Kind::Sqlite => "UPDATE counters SET step = step + 1 RETURNING step, $1",
+            Kind::Postgres => {
+                "UPDATE counters SET step = step + 1 WHERE $1 >= 0
+                 RETURNING step, CAST(EXTRACT(EPOCH FROM clock_timestamp()) * 1000 AS BIGINT)"
+            }
+        };
+        let next = sqlx::query_as(next).bind(now.0 as i64);
+        let (number, ledger_now): (i64, i64) = next.fetch_one(&mut *transaction).await.map_err(&failed)?;
+        Ok(Self { transaction, kind, number, now: (now, ledger_now) })
+    }
+
+    /// Its number: one more than that of the step before it, whoever took that.
+    pub fn number(&self) -> i64 {
+        self.number
+    }
+
+    /// What others changed after a step.
+    pub async fn changes(&mut self, after: i64) -> Result<Vec<Change>, LedgerError> {
+        rows::rows(&mut self.transaction, self.kind, after, self.now.0, self.now.1).await
+    }
+
+    /// A moment of the driver by the ledger's clock.
+    fn on_ledger_clock(&self, moment: Timestamp) -> i64 {
+        moment.0 as i64 - self.now.0.0 as i64 + self.now.1
     }
 
     /// Makes the step durable.
@@ -36,15 +65,15 @@ impl Step {
     async fn execute(
         &mut self,
         what: &'static str,
-        query: Query<'_, Sqlite, SqliteArguments>,
-    ) -> Result<SqliteQueryResult, LedgerError> {
+        query: Query<'_, Any, AnyArguments>,
+    ) -> Result<AnyQueryResult, LedgerError> {
         query.execute(&mut *self.transaction).await.map_err(LedgerError::statement(what))
     }
 
     async fn changed(
         &mut self,
         what: &'static str,
-        query: Query<'_, Sqlite, SqliteArguments>,
+        query: Query<'_, Any, AnyArguments>,
     ) -> Result<bool, LedgerError> {
         Ok(self.execute(what, query).await?.rows_affected() > 0)
     }
@@ -74,13 +103,15 @@ impl Step {
     /// Adds a job, behind all others.
     pub async fn insert_job(&mut self, job: &Job) -> Result<bool, LedgerError> {
         let query = sqlx::query(
-            "INSERT INTO jobs (id, kind, view, spec, needs) VALUES ($1, $2, $3, $4, $5) ON CONFLICT DO NOTHING",
+            "INSERT INTO jobs (id, kind, view, spec, needs, changed) VALUES ($1, $2, $3, $4, $5, $6)
+             ON CONFLICT DO NOTHING",
         )
         .bind(job.id.0.to_vec())
         .bind(job.spec.kind())
         .bind(view(job))
         .bind(encode_job(job))
-        .bind(job.needs.iter().flat_map(|JobId(hash)| *hash).collect::<Vec<u8>>());
+        .bind(job.needs.iter().flat_map(|JobId(hash)| *hash).collect::<Vec<u8>>())
+        .bind(self.number);
         self.changed("add a job", query).await
     }
 
@@ -98,25 +129,26 @@ impl Step {
     pub async fn reopen(&mut self, job: &JobId, why: Reopening) -> Result<bool, LedgerError> {
         let query = match why {
             Reopening::Resubmitted => sqlx::query(
-                "UPDATE jobs SET state = 'open', worker = NULL, ended = 0, failures = 0, losses = 0, suspect = 0, deaths_alone = 0
+                "UPDATE jobs SET changed = $2, state = 'open', worker = NULL, ended = 0, failures = 0, losses = 0, suspect = 0, deaths_alone = 0
                  WHERE id = $1 AND state IN ('failed', 'cancelled')",
             ),
             Reopening::ResultLost => sqlx::query(
-                "UPDATE jobs SET state = 'open', worker = NULL, ended = 0, failures = 0, losses = 0, suspect = 0, deaths_alone = 0,
+                "UPDATE jobs SET changed = $2, state = 'open', worker = NULL, ended = 0, failures = 0, losses = 0, suspect = 0, deaths_alone = 0,
                                  blob = NULL, blob_length = NULL
                  WHERE id = $1 AND state = 'done'",
             ),
             Reopening::NewInput => sqlx::query(
-                "UPDATE jobs SET state = 'open', worker = NULL, ended = 0, failures = 0, losses = 0, suspect = 0, deaths_alone = 0,
+                "UPDATE jobs SET changed = $2, state = 'open', worker = NULL, ended = 0, failures = 0, losses = 0, suspect = 0, deaths_alone = 0,
                                  blob = NULL, blob_length = NULL
                  WHERE id = $1 AND state IN ('done', 'leased')",
             ),
         };
-        let changed = self.changed("reopen a job", query.bind(job.0.to_vec())).await?;
+        let changed = self.changed("reopen a job", query.bind(job.0.to_vec()).bind(self.number)).await?;
         if why != Reopening::NewInput {
             return Ok(changed);
         }
-        let query = sqlx::query("UPDATE jobs SET outdated = 1 WHERE id = $1").bind(job.0.to_vec());
+        let query = sqlx::query("UPDATE jobs SET outdated = 1, changed = $2 WHERE id = $1");
+        let query = query.bind(job.0.to_vec()).bind(self.number);
         self.changed("mark a job as outdated", query).await
     }
 
@@ -128,12 +160,22 @@ impl Step {
         worker: &WorkerId,
         deadline: Timestamp,
     ) -> Result<bool, LedgerError> {
-        let query = sqlx::query(
-            "UPDATE jobs SET state = 'leased', attempt = $2, worker = $3, deadline_ms = $4
-             WHERE id = $1 AND state = 'open' AND attempt = $2 - 1",
-        );
-        let query = query.bind(job.0.to_vec()).bind(i64::from(attempt.0));
-        self.changed("claim a job", query.bind(&worker.0).bind(deadline.0 as i64)).await
+        let query = match self.kind {
+            Kind::Sqlite => sqlx::query(
+                "UPDATE jobs SET state = 'leased', attempt = $2, worker = $3, deadline_ms = $4, changed = $5
+                 WHERE id = $1 AND state = 'open' AND attempt = $2 - 1",
+            ),
+            // A row that somebody else has his hands on is not waited for: there are others.
+            Kind::Postgres => sqlx::query(
+                "UPDATE jobs SET state = 'leased', attempt = $2, worker = $3, deadline_ms = $4, changed = $5
+                 WHERE position = (SELECT position FROM jobs
+                                   WHERE id = $1 AND state = 'open' AND attempt = $2 - 1
+                                   FOR UPDATE SKIP LOCKED)",
+            ),
+        };
+        let query = query.bind(job.0.to_vec()).bind(i64::from(attempt.0)).bind(&worker.0);
+        let query = query.bind(self.on_ledger_clock(deadline)).bind(self.number);
+        self.changed("claim a job", query).await
     }
 
     /// Prolongs a lease.
@@ -145,10 +187,12 @@ impl Step {
         deadline: Timestamp,
     ) -> Result<bool, LedgerError> {
         let query = sqlx::query(
-            "UPDATE jobs SET deadline_ms = $4 WHERE id = $1 AND attempt = $2 AND worker = $3 AND state = 'leased'",
+            "UPDATE jobs SET deadline_ms = $4, changed = $5
+             WHERE id = $1 AND attempt = $2 AND worker = $3 AND state = 'leased'",
         );
-        let query = query.bind(job.0.to_vec()).bind(i64::from(attempt.0));
-        self.changed("renew a lease", query.bind(&worker.0).bind(deadline.0 as i64)).await
+        let query = query.bind(job.0.to_vec()).bind(i64::from(attempt.0)).bind(&worker.0);
+        let query = query.bind(self.on_ledger_clock(deadline)).bind(self.number);
+        self.changed("renew a lease", query).await
     }
 
     /// Publishes a result.
@@ -165,7 +209,7 @@ impl Step {
             "UPDATE jobs SET state = 'done', blob = $4, blob_length = $5, measurements = $6, seconds = $7,
                              failures = 0, losses = 0, suspect = 0, deaths_alone = 0, outdated = 0,
                              failure_code = NULL, failure = NULL,
-                             ended = $8
+                             ended = $8, changed = $9
              WHERE id = $1 AND attempt = $2 AND worker = $3 AND state = 'leased'",
         );
         let query = query
@@ -176,7 +220,8 @@ impl Step {
             .bind(success.length as i64)
             .bind(measurements)
             .bind(success.seconds)
-            .bind(self.next_end().await?);
+            .bind(self.next_end().await?)
+            .bind(self.number);
         self.changed("publish a result", query).await
     }
 
@@ -189,12 +234,14 @@ impl Step {
         failure: &Failure,
     ) -> Result<bool, LedgerError> {
         let query = sqlx::query(
-            "UPDATE jobs SET state = 'open', worker = NULL, failures = $3, losses = $4, failure_code = $5, failure = $6
+            "UPDATE jobs SET state = 'open', worker = NULL, failures = $3, losses = $4, failure_code = $5, failure = $6,
+                             changed = $7
              WHERE id = $1 AND attempt = $2 AND state = 'leased'",
         );
         let query = query.bind(job.0.to_vec()).bind(i64::from(attempt.0));
         let query = query.bind(i64::from(failures)).bind(i64::from(losses));
-        self.changed("open a failed job again", query.bind(&failure.code).bind(&failure.message)).await
+        let query = query.bind(&failure.code).bind(text(&failure.message)).bind(self.number);
+        self.changed("open a failed job again", query).await
     }
 
     /// Lets a job fail for good.
@@ -207,18 +254,19 @@ impl Step {
         let query = sqlx::query(
             "UPDATE jobs SET state = 'failed', failures = 0, losses = 0, suspect = 0, deaths_alone = 0, outdated = 1,
                              failure_code = $3, failure = $4,
-                             ended = $5
+                             ended = $5, changed = $6
              WHERE id = $1 AND attempt = $2 AND state = 'leased'",
         );
         let query = query.bind(job.0.to_vec()).bind(i64::from(attempt.0));
-        let query = query.bind(&failure.code).bind(&failure.message).bind(self.next_end().await?);
+        let query = query.bind(&failure.code).bind(text(&failure.message));
+        let query = query.bind(self.next_end().await?).bind(self.number);
         self.changed("let a job fail", query).await
     }
 
     /// The number of the next job that ends. Never given twice, not even when the job that had the
     /// highest runs again: who has seen the end of that one must see the new one too.
     async fn next_end(&mut self) -> Result<i64, LedgerError> {
-        sqlx::query_scalar("UPDATE ends SET latest = latest + 1 RETURNING latest")
+        sqlx::query_scalar("UPDATE counters SET ended = ended + 1 RETURNING ended")
             .fetch_one(&mut *self.transaction)
             .await
             .map_err(LedgerError::statement("number the end of a job"))
@@ -227,9 +275,11 @@ impl Step {
     /// Takes a lease back without blame.
     pub async fn release(&mut self, job: &JobId, attempt: Attempt) -> Result<bool, LedgerError> {
         let query = sqlx::query(
-            "UPDATE jobs SET state = 'open', worker = NULL WHERE id = $1 AND attempt = $2 AND state = 'leased'",
+            "UPDATE jobs SET state = 'open', worker = NULL, changed = $3
+             WHERE id = $1 AND attempt = $2 AND state = 'leased'",
         );
-        self.changed("release a job", query.bind(job.0.to_vec()).bind(i64::from(attempt.0))).await
+        let query = query.bind(job.0.to_vec()).bind(i64::from(attempt.0)).bind(self.number);
+        self.changed("release a job", query).await
     }
 
     /// Takes a lease back and blames its end on the job.
@@ -240,19 +290,24 @@ impl Step {
         deaths_alone: u32,
     ) -> Result<bool, LedgerError> {
         let query = sqlx::query(
-            "UPDATE jobs SET state = 'open', worker = NULL, suspect = 1, deaths_alone = $3
+            "UPDATE jobs SET state = 'open', worker = NULL, suspect = 1, deaths_alone = $3, changed = $4
              WHERE id = $1 AND attempt = $2 AND state = 'leased'",
         );
-        let query = query.bind(job.0.to_vec()).bind(i64::from(attempt.0)).bind(i64::from(deaths_alone));
+        let query = query
+            .bind(job.0.to_vec())
+            .bind(i64::from(attempt.0))
+            .bind(i64::from(deaths_alone))
+            .bind(self.number);
         self.changed("suspect a job", query).await
     }
 
     /// Cancels a job.
     pub async fn cancel(&mut self, job: &JobId) -> Result<bool, LedgerError> {
         let query = sqlx::query(
-            "UPDATE jobs SET state = 'cancelled', worker = NULL WHERE id = $1 AND state IN ('open', 'leased')",
+            "UPDATE jobs SET state = 'cancelled', worker = NULL, changed = $2
+             WHERE id = $1 AND state IN ('open', 'leased')",
         );
-        self.changed("cancel a job", query.bind(job.0.to_vec())).await
+        self.changed("cancel a job", query.bind(job.0.to_vec()).bind(self.number)).await
     }
 
     /// Marks a run as cancelled.
@@ -300,4 +355,9 @@ impl Step {
 
 fn view(job: &Job) -> Option<i64> {
     job.spec.view().map(|ViewId(id)| i64::from(id))
+}
+
+/// PostgreSQL keeps no text with a zero in it.
+fn text(message: &str) -> String {
+    message.replace('\0', "")
 }

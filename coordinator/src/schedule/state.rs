@@ -187,6 +187,11 @@ impl Snapshot {
         self.workers.values().filter(|worker| worker.reported).count()
     }
 
+    /// Whether the lease of some worker runs, here or at another coordinator.
+    pub fn has_holder(&self) -> bool {
+        self.workers.values().any(|worker| worker.reported || !worker.holds.is_empty())
+    }
+
     /// How many jobs a worker holds.
     pub fn held_by(&self, worker: &WorkerId) -> usize {
         self.workers.get(worker).map_or(0, |worker| worker.holds.len())
@@ -201,6 +206,79 @@ impl Snapshot {
         self.get(job).is_some_and(|job| {
             job.attempt == attempt && matches!(&job.state, State::Leased { worker: of, .. } if of == worker)
         })
+    }
+
+    /// Takes over what another coordinator did with a job, as the ledger has it now; `deadline` is the end of
+    /// its lease, if it has one. Says whether the snapshot can hold it.
+    ///
+    /// What this coordinator knows better stays: when a job may be tried again, whether it was begun.
+    pub fn observe(&mut self, record: JobRecord, deadline: Option<Timestamp>, now: Timestamp) -> bool {
+        let holder = match &record.state {
+            LedgerState::Leased(worker) => Some(worker.clone()),
+            _ => None,
+        };
+        let is_known = match self.ordinals.get(&record.shape.id) {
+            None => self.add(record, now),
+            Some(&ordinal) => {
+                self.overwrite(ordinal, record, now);
+                true
+            }
+        };
+        // Whoever renews the lease knows that the worker lives.
+        let ends = deadline.unwrap_or_else(|| now.plus(self.lease_ms));
+        if let Some(worker) = holder.and_then(|holder| self.workers.get_mut(&holder)) {
+            worker.deadline = if worker.reported { worker.deadline.max(ends) } else { ends };
+        }
+        is_known
+    }
+
+    fn overwrite(&mut self, ordinal: Ordinal, record: JobRecord, now: Timestamp) {
+        let JobRecord { state, attempt, failures, losses, suspect, deaths_alone, outdated, .. } = record;
+        self.drop_from_holder(ordinal);
+        self.leave_ready(ordinal);
+        let job = &mut self.jobs[ordinal as usize];
+        let is_same = job.attempt == attempt;
+        let old = std::mem::replace(&mut job.state, State::Cancelled);
+        (job.attempt, job.failures, job.losses) = (attempt, failures, losses);
+        (job.suspect, job.deaths_alone, job.outdated) = (suspect, deaths_alone, outdated);
+        let mut not_before = Timestamp::default();
+        match state {
+            LedgerState::Open => {
+                if let (State::Open { not_before: known, .. }, true) = (&old, is_same) {
+                    not_before = *known;
+                }
+                job.state = State::Open { unmet: 0, not_before };
+            }
+            LedgerState::Leased(worker) => {
+                let was_started =
+                    matches!(&old, State::Leased { started: true, worker: of } if of == &worker);
+                let started = is_same && was_started;
+                let deadline = now.plus(self.lease_ms);
+                let holder = self.workers.entry(worker.clone()).or_insert_with(|| Worker::new(deadline));
+                holder.holds.push(ordinal);
+                job.state = State::Leased { worker, started };
+            }
+            LedgerState::Done => job.state = State::Done,
+            LedgerState::Failed => job.state = State::Failed,
+            LedgerState::Cancelled => {}
+        }
+        let (had_ended, has_ended) = (old.has_ended(), job.state.has_ended());
+        let is_open = matches!(job.state, State::Open { .. });
+        match (had_ended, has_ended) {
+            (true, false) => self.tell_dependents(ordinal, |unmet| unmet + 1),
+            (false, true) => self.tell_dependents(ordinal, |unmet| unmet.saturating_sub(1)),
+            _ => {}
+        }
+        if is_open {
+            self.enter_open(ordinal, not_before);
+        }
+    }
+
+    /// Puts the end of every lease off: for this long nobody could have reported.
+    pub fn prolong(&mut self, ms: u64) {
+        for worker in self.workers.values_mut() {
+            worker.deadline = worker.deadline.plus(ms);
+        }
     }
 
     /// Changes the snapshot as the command says; `false` when the command comes too late, so that

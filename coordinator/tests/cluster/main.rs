@@ -1,5 +1,7 @@
 //! A coordinator and toy workers over real sockets, in one process.
 
+mod postgres;
+mod shared;
 mod submissions;
 mod toy;
 
@@ -9,12 +11,37 @@ use planesweep_coordinator::{Config, Coordinator, StartError};
 use planesweep_plan::{Attempt, Job, NUMERICS_VERSION, RunId, WorkerId};
 use planesweep_proto::{CODE_VERSION, Client, Code, JobState, PROTOCOL_VERSION, ServiceError, SubmitHeader};
 
-use toy::{DEADLINE, Toy, cloud, config, finished, plan, start, submit, undisturbed};
+use toy::{DEADLINE, Place, Toy, cloud, config, finished, plan, start, submit, undisturbed};
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn two_workers_do_a_plan_and_the_next_run_does_nothing() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let handle = start(&folder).await;
+/// What every ledger must do.
+macro_rules! on_every_ledger {
+    ($($test:ident),* $(,)?) => {
+        mod on_sqlite {
+            $(#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+            async fn $test() {
+                super::$test(super::Place::file()).await;
+            })*
+        }
+        mod on_postgres {
+            $(#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+            async fn $test() {
+                if let Some(place) = super::Place::postgres(stringify!($test)) {
+                    super::$test(place).await;
+                }
+            })*
+        }
+    };
+}
+
+on_every_ledger!(
+    two_workers_do_a_plan_and_the_next_run_does_nothing,
+    a_silent_worker_loses_its_job_and_its_late_result_is_refused,
+    a_restarted_coordinator_goes_on_and_takes_what_workers_kept,
+    a_run_submitted_alone_ends_the_others_and_cancelled_jobs_are_revoked,
+);
+
+async fn two_workers_do_a_plan_and_the_next_run_does_nothing(place: Place) {
+    let handle = start(&place).await;
     let jobs = plan(6);
     let workers = [Toy::new(&handle.url(), "w1").work(), Toy::new(&handle.url(), "w2").work()];
     let (run, reused) = submit(&handle, jobs.clone()).await;
@@ -45,10 +72,8 @@ async fn two_workers_do_a_plan_and_the_next_run_does_nothing() {
     assert_eq!(done, 20);
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_silent_worker_loses_its_job_and_its_late_result_is_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let handle = start(&folder).await;
+async fn a_silent_worker_loses_its_job_and_its_late_result_is_refused(place: Place) {
+    let handle = start(&place).await;
     let jobs = plan(3);
     let (run, _) = submit(&handle, jobs.clone()).await;
     let waits = handle.status(&run, 0).await.expect("a status");
@@ -76,22 +101,23 @@ async fn a_silent_worker_loses_its_job_and_its_late_result_is_refused() {
     worker.await.expect("no panic");
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_restarted_coordinator_goes_on_and_takes_what_workers_kept() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let first = start(&folder).await;
+async fn a_restarted_coordinator_goes_on_and_takes_what_workers_kept(place: Place) {
+    let first = start(&place).await;
     let jobs = plan(4);
     let (run, _) = submit(&first, jobs.clone()).await;
     let mut toy = Toy::new(&first.url(), "keeps working");
     let done = toy.until_granted().await;
     toy.finish(&done);
     let kept = toy.until_granted().await;
-    assert!(matches!(Coordinator::start(config(&folder)).await, Err(StartError::Ledger(_))), "one at a time");
+    if place.postgres.is_none() {
+        let other = Coordinator::start(config(&place)).await;
+        assert!(matches!(other, Err(StartError::Ledger(_))), "one at a time");
+    }
     // Dropped, not shut down: nobody is told anything.
     drop(first);
     let second = tokio::time::timeout(DEADLINE, async {
         loop {
-            match Coordinator::start(config(&folder)).await {
+            match Coordinator::start(config(&place)).await {
                 Ok(handle) => return handle,
                 Err(_) => tokio::time::sleep(Duration::from_millis(10)).await,
             }
@@ -113,10 +139,10 @@ async fn a_restarted_coordinator_goes_on_and_takes_what_workers_kept() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_uninvited_are_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let open = Config { listen: ([0, 0, 0, 0], 0).into(), ..config(&folder) };
+    let place = Place::file();
+    let open = Config { listen: ([0, 0, 0, 0], 0).into(), ..config(&place) };
     assert!(matches!(Coordinator::start(open).await, Err(StartError::Config(_))), "no token, no other hosts");
-    let guarded = Config { token: Some("s3cret".into()), ..config(&folder) };
+    let guarded = Config { token: Some("s3cret".into()), ..config(&place) };
     let handle = Coordinator::start(guarded).await.expect("a good configuration");
     let run = RunId("none-1".into());
     for (token, code) in [
@@ -138,8 +164,8 @@ async fn the_uninvited_are_refused() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn other_versions_are_refused_by_name() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let handle = start(&folder).await;
+    let place = Place::file();
+    let handle = start(&place).await;
     let mut client = planesweep_proto::wire::coordinator_client::CoordinatorClient::connect(handle.url())
         .await
         .expect("a connection");
@@ -162,10 +188,8 @@ async fn other_versions_are_refused_by_name() {
     handle.shutdown().await;
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_run_submitted_alone_ends_the_others_and_cancelled_jobs_are_revoked() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let handle = start(&folder).await;
+async fn a_run_submitted_alone_ends_the_others_and_cancelled_jobs_are_revoked(place: Place) {
+    let handle = start(&place).await;
     let (old, _) = submit(&handle, plan(5)).await;
     let mut toy = Toy::new(&handle.url(), "w1");
     let grant = toy.until_granted().await;

@@ -10,7 +10,7 @@ use sqlx::SqlitePool;
 use sqlx::sqlite::SqliteConnectOptions;
 use tempfile::TempDir;
 
-use crate::toy::{Toy, config, finished, plan, start, submit};
+use crate::toy::{Place, Toy, config, finished, plan, start, submit};
 
 async fn submit_here(handle: &Handle, jobs: Vec<Job>) -> Result<Submitted, ServiceError> {
     handle.submit(SubmitHeader { name: "toy".into(), ..SubmitHeader::default() }, jobs).await
@@ -48,8 +48,8 @@ fn rename(jobs: &mut [Job], by: u32, folder: &Path) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_job_that_the_wire_refuses_is_refused_in_process_by_name() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let handle = start(&folder).await;
+    let place = Place::file();
+    let handle = start(&place).await;
     let spoilt = |which: usize, spoil: &dyn Fn(&mut JobSpec)| {
         let mut jobs = plan(3);
         spoil(&mut jobs[which].spec);
@@ -81,11 +81,11 @@ async fn a_job_that_the_wire_refuses_is_refused_in_process_by_name() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_row_that_does_not_decode_fails_alone() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let handle = start(&folder).await;
+    let place = Place::file();
+    let handle = start(&place).await;
     let (run, _) = submit(&handle, plan(3)).await;
     let spoil = sqlx::query("UPDATE jobs SET spec = x'ff' WHERE kind = 'infer' AND view = 1");
-    assert_eq!(spoil.execute(&rows(&folder).await).await.expect("a change").rows_affected(), 1);
+    assert_eq!(spoil.execute(&rows(&place.folder).await).await.expect("a change").rows_affected(), 1);
     let worker = Toy::new(&handle.url(), "w1").work();
     let status = finished(&handle, &run).await;
     assert_eq!((status.count(JobState::Done), status.count(JobState::Failed)), (9, 1));
@@ -99,8 +99,8 @@ async fn a_row_that_does_not_decode_fails_alone() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_scene_that_moved_goes_on_with_the_new_paths_and_views() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let handle = start(&folder).await;
+    let place = Place::file();
+    let handle = start(&place).await;
     let (_, _) = submit(&handle, plan(3)).await;
     let mut toy = Toy::new(&handle.url(), "w1");
     let done = toy.until_granted().await;
@@ -131,8 +131,8 @@ async fn a_scene_that_moved_goes_on_with_the_new_paths_and_views() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn twins_are_done_once_and_false_twins_are_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let handle = start(&folder).await;
+    let place = Place::file();
+    let handle = start(&place).await;
     let mut twin = plan(3);
     rename(&mut twin[..1], 7, Path::new("/twin"));
     let mut jobs = plan(3);
@@ -154,8 +154,8 @@ async fn twins_are_done_once_and_false_twins_are_refused() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn lost_inputs_do_not_use_up_the_tries_of_who_finds_them_lost() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let handle = start(&folder).await;
+    let place = Place::file();
+    let handle = start(&place).await;
     let jobs = plan(2);
     let filter = jobs[2].id;
     let (run, _) = submit(&handle, jobs.clone()).await;
@@ -179,7 +179,7 @@ async fn lost_inputs_do_not_use_up_the_tries_of_who_finds_them_lost() {
     }
     assert_eq!(toy.report().await.expect("an answer").order, Order::Work);
     let counted = sqlx::query_as::<_, (i64, i64)>("SELECT failures, losses FROM jobs WHERE id = $1");
-    let counted = counted.bind(filter.0.to_vec()).fetch_one(&rows(&folder).await).await;
+    let counted = counted.bind(filter.0.to_vec()).fetch_one(&rows(&place.folder).await).await;
     assert_eq!(counted.expect("a row"), (0, 4));
     let worker = Toy::new(&handle.url(), "w2").work();
     assert_eq!(finished(&handle, &run).await.count(JobState::Done), 7);
@@ -189,8 +189,8 @@ async fn lost_inputs_do_not_use_up_the_tries_of_who_finds_them_lost() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_last_job_is_seen_again_when_it_ran_again() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let handle = start(&folder).await;
+    let place = Place::file();
+    let handle = start(&place).await;
     let jobs = plan(3);
     let cloud = jobs[9].id;
     let (run, _) = submit(&handle, jobs).await;
@@ -209,7 +209,7 @@ async fn the_last_job_is_seen_again_when_it_ran_again() {
     worker.await.expect("no panic");
 
     // Nor does a coordinator that starts while that job is open count from anew.
-    let handle = Coordinator::start(config(&folder)).await.expect("the ledger is free");
+    let handle = Coordinator::start(config(&place)).await.expect("the ledger is free");
     let worker = Toy::new(&handle.url(), "w2").work();
     let once_more = recent(&handle, again[0].1).await;
     assert!(matches!(once_more[..], [(job, _)] if job == cloud), "{once_more:?}");

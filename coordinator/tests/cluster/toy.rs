@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use planesweep_coordinator::{Config, Coordinator, Handle};
+use planesweep_coordinator::{Config, Coordinator, Handle, LedgerPlace};
 use planesweep_fusion::FilterOptions;
 use planesweep_plan::{
     AssembleSpec, Attempt, BlobKey, EmitSpec, FilterSpec, ImageSpec, InferSpec, Job, JobId, JobSpec,
@@ -16,6 +16,8 @@ use planesweep_proto::{
 use planesweep_scene::{Camera, DepthHypotheses, Distortion, Intrinsics, Pose, Sampling, ViewId};
 use tempfile::TempDir;
 use tokio::task::JoinHandle;
+
+use crate::postgres::Postgres;
 
 /// How long a test waits for a state before it fails.
 pub(crate) const DEADLINE: Duration = Duration::from_mins(1);
@@ -178,12 +180,33 @@ impl Toy {
     }
 }
 
-pub(crate) fn config(folder: &TempDir) -> Config {
-    Config { lease: LEASE, ..Config::new(folder.path().join("ledger.sqlite"), "file:///store") }
+/// Where a test's ledger lies.
+pub(crate) struct Place {
+    pub(crate) folder: TempDir,
+    pub(crate) postgres: Option<Postgres>,
 }
 
-pub(crate) async fn start(folder: &TempDir) -> Handle {
-    Coordinator::start(config(folder)).await.expect("a free port and a good ledger")
+impl Place {
+    pub(crate) fn file() -> Self {
+        Self { folder: tempfile::tempdir().expect("a folder"), postgres: None }
+    }
+
+    /// `None` where there is no PostgreSQL; then `test` is skipped.
+    pub(crate) fn postgres(test: &str) -> Option<Self> {
+        Some(Self { postgres: Some(Postgres::start(test)?), ..Self::file() })
+    }
+}
+
+pub(crate) fn config(place: &Place) -> Config {
+    let ledger = match &place.postgres {
+        Some(postgres) => LedgerPlace::from(&*postgres.url()),
+        None => place.folder.path().join("ledger.sqlite").into(),
+    };
+    Config { lease: LEASE, ..Config::new(ledger, "file:///store") }
+}
+
+pub(crate) async fn start(place: &Place) -> Handle {
+    Coordinator::start(config(place)).await.expect("a free port and a good ledger")
 }
 
 pub(crate) async fn submit(handle: &Handle, jobs: Vec<Job>) -> (RunId, u32) {
