@@ -1,10 +1,10 @@
-//! Image features (paper section 3.1): eight layers of convolution, shared by all views.
+//! Image features (paper section 3.1): eight layers of convolution, or one, shared by all views.
 
 use tch::{Device, Kind, TchError, Tensor};
 
-use crate::Weights;
 use crate::convolution::Convolution;
 use crate::weights::KernelOrder;
+use crate::{FeatureNetwork, Weights};
 
 /// Strides of the layers that batch normalisation follows.
 const STRIDES: [i64; 7] = [1, 1, 2, 1, 1, 2, 1];
@@ -17,13 +17,17 @@ pub(crate) struct FeatureNet {
 
 impl FeatureNet {
     pub(crate) fn new(weights: &Weights, options: (Kind, Device)) -> Result<Self, TchError> {
+        let last = weights.biased("feature.feature");
+        if weights.metadata().features == FeatureNetwork::SingleLayer {
+            return Ok(Self { layers: vec![Convolution::new(&last, 4, false, options)?] });
+        }
         let mut layers = Vec::new();
         for (i, stride) in STRIDES.into_iter().enumerate() {
             let (convolution, batch_norm) = (format!("feature.conv{i}.conv"), format!("feature.conv{i}.bn"));
             let folded = weights.normalised(&convolution, &batch_norm, KernelOrder::OutputFirst);
             layers.push(Convolution::new(&folded, stride, true, options)?);
         }
-        layers.push(Convolution::new(&weights.biased("feature.feature"), 1, false, options)?);
+        layers.push(Convolution::new(&last, 1, false, options)?);
         Ok(Self { layers })
     }
 

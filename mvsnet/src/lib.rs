@@ -9,6 +9,7 @@
 mod analytic;
 mod backend;
 mod bands;
+mod blocks;
 mod confidence;
 mod cpu_backend;
 mod feature_cache;
@@ -51,6 +52,6 @@ pub use rates::InferRates;
 #[cfg(feature = "torch")]
 pub use torch_backend::{PlainTimes, TorchBackend, TorchBackendError};
 pub use weights::{
-    CheckpointError, CostMetric, ImportOptions, Normalization, PickleError, Refinement, WeightTensor,
-    Weights, WeightsError, WeightsMetadata,
+    CheckpointError, CostMetric, FeatureNetwork, ImportOptions, Normalization, PickleError, Refinement,
+    WeightTensor, Weights, WeightsError, WeightsMetadata,
 };

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use super::layers::FeatureLayers;
+use crate::blocks::blocks;
 use crate::input::InputImage;
 use crate::kernels::cost::FeatureMap;
 use crate::kernels::slab::{Pool, Shape, Slab};
@@ -15,6 +16,12 @@ use crate::kernels::winograd::{Target, WinogradLayer};
 
 /// The features of an image at a quarter of its size.
 pub(crate) fn features(pool: &Arc<Pool>, layers: &FeatureLayers, image: &InputImage) -> FeatureMap {
+    let layers = match layers {
+        FeatureLayers::Paper(layers) => layers,
+        FeatureLayers::Single(layer) => {
+            return FeatureMap::new(&same_size(pool, layer, &blocks(pool, image)));
+        }
+    };
     let mut slab = to_slab(pool, image);
     for layer in &layers.full {
         slab = same_size(pool, layer, &slab);

@@ -6,11 +6,20 @@ use crate::kernels::strided::StridedLayer;
 use crate::kernels::transposed::TransposedLayer;
 use crate::kernels::winograd::WinogradLayer;
 use crate::weights::{FoldedConvolution, KernelOrder};
-use crate::{Refinement, Weights};
+use crate::{FeatureNetwork, Refinement, Weights, blocks};
 
-/// Image features (paper section 3.1), in the order of the layers.
+/// Image features (paper section 3.1).
 #[derive(Debug)]
-pub(crate) struct FeatureLayers {
+pub(crate) enum FeatureLayers {
+    /// Eight layers.
+    Paper(Box<PaperLayers>),
+    /// One layer, over blocks of pixels.
+    Single(WinogradLayer),
+}
+
+/// The paper's layers in their order.
+#[derive(Debug)]
+pub(crate) struct PaperLayers {
     pub(crate) full: [WinogradLayer; 2],
     pub(crate) to_half: StridedLayer,
     pub(crate) half: [WinogradLayer; 2],
@@ -32,6 +41,12 @@ pub(crate) struct RegularizationLayers {
 
 impl FeatureLayers {
     pub(crate) fn new(weights: &Weights, level: Level) -> Self {
+        let last = weights.biased("feature.feature");
+        if weights.metadata().features == FeatureNetwork::SingleLayer {
+            let kernel = |o, c, _, row, k| blocks::tap(o, c, row, k).map_or(0.0, |tap| last.weight[tap]);
+            let sizes = [blocks::CHANNELS, last.shape[0], 1];
+            return Self::Single(WinogradLayer::new(level, sizes, kernel, &last.bias, false));
+        }
         let folded = |i: usize| {
             let (convolution, batch_norm) = (format!("feature.conv{i}.conv"), format!("feature.conv{i}.bn"));
             weights.normalised(&convolution, &batch_norm, KernelOrder::OutputFirst)
@@ -43,13 +58,13 @@ impl FeatureLayers {
             let kernel = |o, c, row, k| weight[(o * inputs + c) * 25 + row * 5 + k];
             StridedLayer::new(level, [inputs, shape[0], 5, 5], kernel, &bias, true)
         };
-        Self {
+        Self::Paper(Box::new(PaperLayers {
             full: [plain(0), plain(1)],
             to_half: strided(2),
             half: [plain(3), plain(4)],
             to_quarter: strided(5),
-            quarter: [plain(6), image_layer(level, &weights.biased("feature.feature"), false)],
-        }
+            quarter: [plain(6), image_layer(level, &last, false)],
+        }))
     }
 }
 

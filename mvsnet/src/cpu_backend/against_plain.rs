@@ -15,7 +15,7 @@ use tch::{Device, IndexOp, Kind, Tensor};
 use super::*;
 use crate::backend::conformance::Images;
 use crate::network::{FeatureView, Network};
-use crate::{ImportOptions, Refinement, WeightsMetadata, depth};
+use crate::{FeatureNetwork, ImportOptions, Refinement, WeightsMetadata, depth};
 
 /// What a network says of some pixels.
 #[derive(Default)]
@@ -109,25 +109,19 @@ fn ours(weights: &Weights, images: &Images, level: Level, step_rows: usize) -> S
 }
 
 /// Sizes, depth counts, step heights and seeds; all pixels of all cases are judged together.
-fn compare(refinement: Refinement, metric: CostMetric, sampling: Sampling, level: Level) {
+fn compare(metadata: &WeightsMetadata, sampling: Sampling, level: Level) {
     let (mut all_ours, mut all_plain, mut truth) = <(Said, Said, Said)>::default();
     for (width, height, depths, step_rows, seed) in
         [(96, 64, 16, 3, 1), (150, 70, 27, 8, 2), (64, 190, 48, 5, 3), (33, 47, 9, 1, 4), (20, 25, 5, 2, 5)]
     {
-        let metadata = WeightsMetadata { metric, ..WeightsMetadata::untrained(refinement) };
-        let weights = Weights::seeded(metadata, seed);
+        let weights = Weights::seeded(metadata.clone(), seed);
         let mut images = Images::new(width, height, sampling);
         images.hypotheses = DepthHypotheses::new(sampling, 2.0, 8.0, depths).expect("a valid range");
         all_ours.append(ours(&weights, &images, level, step_rows));
         all_plain.append(plain(&weights, Kind::Float, &images));
         truth.append(plain(&weights, Kind::Double, &images));
     }
-    assert_as_exact(
-        &format!("{refinement:?} {metric:?} {sampling:?} {level:?}"),
-        &all_ours,
-        &all_plain,
-        &truth,
-    );
+    assert_as_exact(&format!("{metadata:?} {sampling:?} {level:?}"), &all_ours, &all_plain, &truth);
 }
 
 /// Random sizes, numbers of depths and of views, step heights, weights and refinements; the errors of the pixels of a
@@ -167,19 +161,32 @@ fn as_exact_for_any_sizes_and_weights() {
 #[test]
 fn as_exact_as_the_plain_network() {
     for level in Level::available() {
-        compare(Refinement::None, CostMetric::Variance, Sampling::Uniform, level);
+        compare(&WeightsMetadata::untrained(Refinement::None), Sampling::Uniform, level);
     }
 }
 
 #[test]
 fn as_exact_with_refinement_and_inverse_sampling() {
-    compare(Refinement::Paper, CostMetric::Variance, Sampling::Inverse, Level::detect());
-    compare(Refinement::WithBnRelu, CostMetric::Variance, Sampling::Uniform, Level::detect());
+    compare(&WeightsMetadata::untrained(Refinement::Paper), Sampling::Inverse, Level::detect());
+    compare(&WeightsMetadata::untrained(Refinement::WithBnRelu), Sampling::Uniform, Level::detect());
 }
 
 #[test]
 fn as_exact_with_the_mean_metric() {
-    compare(Refinement::None, CostMetric::Mean, Sampling::Uniform, Level::detect());
+    let metadata =
+        WeightsMetadata { metric: CostMetric::Mean, ..WeightsMetadata::untrained(Refinement::None) };
+    compare(&metadata, Sampling::Uniform, Level::detect());
+}
+
+#[test]
+fn as_exact_with_a_single_layer_of_features() {
+    for level in Level::available() {
+        let metadata = WeightsMetadata {
+            features: FeatureNetwork::SingleLayer,
+            ..WeightsMetadata::untrained(Refinement::None)
+        };
+        compare(&metadata, Sampling::Uniform, level);
+    }
 }
 
 fn data(path: &str) -> PathBuf {

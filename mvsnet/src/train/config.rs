@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::{CostMetric, Normalization, Refinement};
+use crate::{CostMetric, FeatureNetwork, Normalization, Refinement};
 
 /// A training run. Everything that shapes the weights stands here; the rest follows from the seed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -43,6 +43,9 @@ pub struct NetworkConfig {
     pub refinement: Refinement,
     /// How features become cost.
     pub metric: CostMetric,
+    /// Which feature network there is.
+    #[serde(skip_serializing_if = "FeatureNetwork::is_paper")]
+    pub features: FeatureNetwork,
 }
 
 /// How samples are drawn. Each is drawn from its own number, so a resumed run sees the same ones.
@@ -167,6 +170,7 @@ impl Default for NetworkConfig {
             normalization: Normalization::PerImage,
             refinement: Refinement::None,
             metric: CostMetric::Variance,
+            features: FeatureNetwork::Paper,
         }
     }
 }

@@ -32,6 +32,7 @@ pub(crate) fn metadata(
         normalization: network.normalization,
         refinement: network.refinement,
         metric: network.metric,
+        features: network.features,
         spacing_px,
         source: about.source.clone(),
         licence: about.licence.clone(),

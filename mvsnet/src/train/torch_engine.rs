@@ -12,7 +12,7 @@ use super::engine::{
 use super::parameters::{Tensors, is_statistic};
 use super::{Example, LossConfig};
 use crate::warp::PlaneSweep;
-use crate::{CostMetric, Refinement, WeightTensor, depth};
+use crate::{CostMetric, FeatureNetwork, Refinement, WeightTensor, depth};
 
 /// What PyTorch adds to the variance by default.
 const EPSILON: f64 = 1e-5;
@@ -162,13 +162,16 @@ impl TrainedNetwork {
         options: &GradientOptions,
     ) -> Result<Tensor, TchError> {
         // One batch for batch normalisation, when the sizes agree; sources of other sizes make others.
-        let features = self.features(&Tensor::f_cat(images, 0)?)?;
+        let features = self.features(&Tensor::f_cat(images, 0)?, options.network.features)?;
         let volume = cost_volume(&features, example, options.network.metric)?;
         let logits = self.regularized(&volume)?;
         depth::expected_index(&depth::probability(&logits)?)
     }
 
-    fn features(&mut self, images: &Tensor) -> Result<Tensor, TchError> {
+    fn features(&mut self, images: &Tensor, network: FeatureNetwork) -> Result<Tensor, TchError> {
+        if network == FeatureNetwork::SingleLayer {
+            return self.convolution(images, "feature.feature", 4);
+        }
         let mut x = images.shallow_clone();
         for (i, stride) in [1, 1, 2, 1, 1, 2, 1].into_iter().enumerate() {
             x = self.layer(&x, &format!("feature.conv{i}.conv"), &format!("feature.conv{i}.bn"), stride)?;

@@ -77,7 +77,7 @@ fn split(bytes: &[u8]) -> Result<(&[u8], &[u8]), WeightsError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::weights::Refinement;
+    use crate::weights::{FeatureNetwork, Refinement};
 
     fn weights() -> Weights {
         Weights::seeded(WeightsMetadata::untrained(Refinement::Paper), 7)
@@ -91,6 +91,19 @@ mod tests {
         edit(&mut header);
         let header = header.to_string();
         [&(header.len() as u64).to_le_bytes(), header.as_bytes(), data].concat()
+    }
+
+    #[test]
+    fn files_name_a_feature_network_only_when_it_is_not_the_papers() {
+        let of = |features| {
+            let metadata = WeightsMetadata { features, ..WeightsMetadata::untrained(Refinement::None) };
+            Weights::seeded(metadata, 7)
+        };
+        for (features, named) in [(FeatureNetwork::Paper, false), (FeatureNetwork::SingleLayer, true)] {
+            let bytes = of(features).to_bytes();
+            assert_eq!(String::from_utf8_lossy(&bytes).contains("single-layer"), named);
+            assert_eq!(Weights::from_bytes(&bytes).expect("own file"), of(features));
+        }
     }
 
     #[test]

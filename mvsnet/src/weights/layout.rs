@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::{Refinement, WeightTensor, WeightsError, WeightsMetadata};
+use super::{FeatureNetwork, Refinement, WeightTensor, WeightsError, WeightsMetadata};
 
 /// Statistics and affine parameters of a batch normalisation, each with one value per channel.
 const BATCH_NORM: [&str; 4] = ["weight", "bias", "running_mean", "running_var"];
@@ -12,14 +12,21 @@ pub(crate) fn tensors(metadata: &WeightsMetadata) -> BTreeMap<String, Vec<usize>
     let refinement = metadata.refinement;
     let mut layout = Layout(BTreeMap::new());
     // Section 3.1: output channels, input channels, kernel size.
-    for (i, (o, c, k)) in
-        [(8, 3, 3), (8, 8, 3), (16, 8, 5), (16, 16, 3), (16, 16, 3), (32, 16, 5), (32, 32, 3)]
-            .into_iter()
-            .enumerate()
-    {
-        layout.normalised(&format!("feature.conv{i}.conv"), &format!("feature.conv{i}.bn"), o, &[o, c, k, k]);
+    match metadata.features {
+        FeatureNetwork::Paper => {
+            for (i, (o, c, k)) in
+                [(8, 3, 3), (8, 8, 3), (16, 8, 5), (16, 16, 3), (16, 16, 3), (32, 16, 5), (32, 32, 3)]
+                    .into_iter()
+                    .enumerate()
+            {
+                let (convolution, batch_norm) =
+                    (format!("feature.conv{i}.conv"), format!("feature.conv{i}.bn"));
+                layout.normalised(&convolution, &batch_norm, o, &[o, c, k, k]);
+            }
+            layout.biased("feature.feature", 32, &[32, 32, 3, 3]);
+        }
+        FeatureNetwork::SingleLayer => layout.biased("feature.feature", 32, &[32, 3, 7, 7]),
     }
-    layout.biased("feature.feature", 32, &[32, 32, 3, 3]);
     // Section 3.2, regularisation: down the four scales, then up again, transposed (input channels first).
     for (i, (o, c)) in
         [(8, 32), (16, 8), (16, 16), (32, 16), (32, 32), (64, 32), (64, 64)].into_iter().enumerate()

@@ -47,6 +47,24 @@ pub enum Refinement {
     WithBnRelu,
 }
 
+/// The network of image features (paper section 3.1 and its ablation).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FeatureNetwork {
+    /// Eight layers.
+    #[default]
+    Paper,
+    /// One layer of 7x7 with stride 4.
+    SingleLayer,
+}
+
+impl FeatureNetwork {
+    /// Whether it is the paper's, which is what files mean that say nothing of it.
+    pub(crate) fn is_paper(&self) -> bool {
+        *self == Self::Paper
+    }
+}
+
 /// How the features of the views become one cost (paper equation 2 and its ablation).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -67,6 +85,9 @@ pub struct WeightsMetadata {
     pub refinement: Refinement,
     /// How features become cost.
     pub metric: CostMetric,
+    /// Which feature network there is.
+    #[serde(default, skip_serializing_if = "FeatureNetwork::is_paper")]
+    pub features: FeatureNetwork,
     /// Spacing of the depth hypotheses in training, in pixels of the best source view, when known. It
     /// gives the confidence its meaning.
     pub spacing_px: Option<f64>,
@@ -252,6 +273,7 @@ impl Weights {
             normalization,
             refinement: layout::refinement_of(&tensors),
             metric,
+            features: FeatureNetwork::Paper,
             spacing_px,
             source,
             licence,

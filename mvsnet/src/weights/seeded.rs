@@ -1,6 +1,6 @@
 //! Untrained weights from a seed, the same everywhere, so that tests need no files.
 
-use super::{CostMetric, Normalization, Refinement, Weights, WeightsMetadata, layout};
+use super::{CostMetric, FeatureNetwork, Normalization, Refinement, Weights, WeightsMetadata, layout};
 use crate::weights::WeightTensor;
 
 impl WeightsMetadata {
@@ -10,6 +10,7 @@ impl WeightsMetadata {
             normalization: Normalization::UnitRange,
             refinement,
             metric: CostMetric::Variance,
+            features: FeatureNetwork::Paper,
             spacing_px: None,
             source: "seed".to_owned(),
             licence: "none needed".to_owned(),

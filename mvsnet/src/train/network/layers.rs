@@ -3,6 +3,8 @@
 use super::convolution::{Convolution, Sizes, bias_gradient};
 use super::normalization::{Normalization, NormalizationWeights};
 use super::stack::{Stack, Tools};
+use crate::WeightTensor;
+use crate::blocks::{self, contracted, expanded};
 use crate::kernels::slab::Shape;
 use crate::train::engine::BatchStatistics;
 use crate::train::parameters::Tensors;
@@ -53,7 +55,7 @@ impl Step<'_> {
         let normalization = Normalization::new(&weights, &z);
         if let Some(measured) = &normalization.measured {
             for (part, values) in ["running_mean", "running_var"].into_iter().zip(measured) {
-                let tensor = crate::WeightTensor { shape: vec![values.len()], values: values.clone() };
+                let tensor = WeightTensor { shape: vec![values.len()], values: values.clone() };
                 self.measured.insert(format!("{batch_norm}.{part}"), tensor);
             }
         }
@@ -88,6 +90,31 @@ impl Step<'_> {
             (&self.weights[&format!("{name}.weight")], &self.weights[&format!("{name}.bias")]);
         let output = Convolution::new(Sizes::Same, kernel, Some(bias)).forward(&self.tools, &input);
         (Biased { name: name.to_owned(), input }, output)
+    }
+
+    /// Runs the single layer of features over the blocks of images.
+    pub(super) fn over_blocks(&self, name: &str, input: &Stack) -> Stack {
+        let (kernel, bias) = (self.kernel_over_blocks(name), &self.weights[&format!("{name}.bias")]);
+        Convolution::new(Sizes::Same, &kernel, Some(bias)).forward(&self.tools, input)
+    }
+
+    /// Goes back through it; images learn nothing.
+    pub(super) fn back_over_blocks(&mut self, name: &str, input: &Stack, gradient: &Stack) {
+        let kernel = self.kernel_over_blocks(name);
+        let outputs = kernel.shape[0];
+        let weight = Convolution::new(Sizes::Same, &kernel, None);
+        let values = contracted(&weight.kernel_gradient(&self.tools, input, gradient).values, outputs);
+        let weight = format!("{name}.weight");
+        let shape = self.weights[&weight].shape.clone();
+        self.gradients.insert(weight, WeightTensor { shape, values });
+        self.gradients.insert(format!("{name}.bias"), bias_gradient(gradient, outputs));
+    }
+
+    fn kernel_over_blocks(&self, name: &str) -> WeightTensor {
+        let kernel = &self.weights[&format!("{name}.weight")];
+        let outputs = kernel.shape[0];
+        let shape = vec![outputs, blocks::CHANNELS, 3, 3];
+        WeightTensor { shape, values: expanded(&kernel.values, outputs) }
     }
 
     /// Goes back through it.

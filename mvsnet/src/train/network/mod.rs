@@ -22,15 +22,18 @@ use self::stack::{Stack, Tools};
 use super::Example;
 use super::engine::{EngineError, Gradient, GradientEngine, GradientOptions, IntervalErrors};
 use super::parameters::Tensors;
-use crate::Refinement;
+use crate::blocks::blocks;
 use crate::input::InputImage;
 use crate::kernels::cost::{CHANNELS, CostInput, CostScratch, FeatureMap, PixelSweep};
 use crate::kernels::cost_gradient::FeatureGradients;
 use crate::kernels::simd::Level;
 use crate::kernels::slab::{Pool, Shape};
+use crate::{FeatureNetwork, Refinement};
 
 /// Parts that the gradient of the cost volume is summed in, whatever the number of threads.
 const STRIPS: usize = 8;
+/// The layer of a feature network that has one, and the last of one that has eight.
+const SINGLE: &str = "feature.feature";
 
 /// Gradients by kernels of our own. The number of threads changes no bit of them.
 #[derive(Debug)]
@@ -69,7 +72,7 @@ impl GradientEngine for KernelEngine {
 
 fn run(mut step: Step<'_>, example: &Example, options: &GradientOptions) -> Gradient {
     let tools = step.tools.clone();
-    let (feature_layers, features) = features(&mut step, &example.images);
+    let (feature_layers, features) = features(&mut step, &example.images, options.network.features);
     let maps: Vec<FeatureMap> = features.slabs.par_iter().map(|slab| FeatureMap::new(slab)).collect();
     let shape = features.shape;
     drop(features);
@@ -110,8 +113,21 @@ fn run(mut step: Step<'_>, example: &Example, options: &GradientOptions) -> Grad
     }
 }
 
+/// The feature network's layers, in the order they ran.
+enum FeatureLayers {
+    Paper(Vec<Normalized>, Biased),
+    /// The blocks of the images.
+    Single(Stack),
+}
+
 /// Features of all views, one slab each.
-fn features(step: &mut Step<'_>, images: &[InputImage]) -> ((Vec<Normalized>, Biased), Stack) {
+fn features(step: &mut Step<'_>, images: &[InputImage], network: FeatureNetwork) -> (FeatureLayers, Stack) {
+    if network == FeatureNetwork::SingleLayer {
+        let pool = &step.tools.pool;
+        let input = Stack::new(images.iter().map(|image| Arc::new(blocks(pool, image))).collect());
+        let output = step.over_blocks(SINGLE, &input);
+        return (FeatureLayers::Single(input), output);
+    }
     let (width, height) = (images[0].width, images[0].height);
     let shape = Shape { columns: height, channels: 3, length: width };
     let mut x = Stack::compute(&step.tools, images.len(), shape, |view, slab| {
@@ -129,11 +145,15 @@ fn features(step: &mut Step<'_>, images: &[InputImage]) -> ((Vec<Normalized>, Bi
         layers.push(layer);
         x = output;
     }
-    let (last, features) = step.biased("feature.feature", x);
-    ((layers, last), features)
+    let (last, features) = step.biased(SINGLE, x);
+    (FeatureLayers::Paper(layers, last), features)
 }
 
-fn back_features(step: &mut Step<'_>, (layers, last): (Vec<Normalized>, Biased), gradient: &Stack) {
+fn back_features(step: &mut Step<'_>, layers: FeatureLayers, gradient: &Stack) {
+    let (layers, last) = match layers {
+        FeatureLayers::Paper(layers, last) => (layers, last),
+        FeatureLayers::Single(input) => return step.back_over_blocks(SINGLE, &input, gradient),
+    };
     let mut gradient = Some(step.back_biased(last, gradient));
     for (i, layer) in layers.into_iter().enumerate().rev() {
         // Images learn nothing.
