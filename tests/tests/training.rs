@@ -64,6 +64,31 @@ fn a_killed_run_goes_on_to_the_same_weights() {
 }
 
 #[test]
+fn data_sets_are_trained_on() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let stored = folder.path().join("stored");
+    let stored_name = stored.to_str().expect("UTF-8");
+    let _ = Running::start(["synth", stored_name, "--training", "2", "--seed", "9"]).wait().expect_code(0);
+    let few = "steps = 2\n[samples]\nsizes = [[64, 64]]\ndepths = [8, 16]\n\
+               [progress]\nlog_every = 1\nvalidation_samples = 1\n";
+    let run = |name: &str, data: &str| {
+        let config = folder.path().join(format!("{name}.toml"));
+        fs::write(&config, format!("{few}{data}")).expect("written");
+        let out = folder.path().join(name);
+        (start(&config, &out).wait(), out.join("weights.safetensors"))
+    };
+    let weights = |name: &str, data: &str| {
+        let (finished, weights) = run(name, data);
+        let _ = finished.expect_code(0);
+        fs::read(weights).expect("weights")
+    };
+    let folders = format!("[data]\nfolders = [{stored_name:?}]\n");
+    assert_ne!(weights("stored", &format!("{folders}generated_share = 0.0\n")), weights("generated", ""));
+    let refused = run("refused", &folders).0.expect_code(1);
+    assert!(refused.stderr.contains("data.generated_share must be below 1"), "{}", refused.stderr);
+}
+
+#[test]
 fn another_configuration_and_nonsense_are_refused() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let config = folder.path().join("train.toml");

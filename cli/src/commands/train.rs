@@ -14,7 +14,7 @@ use planesweep_scene::write_atomically;
 use serde_json::json;
 
 use crate::console::Outcome;
-use crate::training::{Curves, Stop, SynthSamples, add_scene};
+use crate::training::{Curves, Samples, Stop, add_scene};
 
 /// Arguments of `train`.
 #[derive(Debug, Args)]
@@ -49,8 +49,10 @@ pub fn run(args: &TrainArgs) -> Result<Outcome> {
     let effective = toml::to_string(&config).context("cannot write the configuration")?;
     write(&out.join(CONFIG), effective.as_bytes())?;
 
-    let source = SynthSamples;
-    let mut validation = ValidationSet::held_out(&source, &config).context("cannot make held-out samples")?;
+    let source = Samples::to_train(&config.data)?;
+    let held_out = Samples::held_out(&config.data)?;
+    let mut validation =
+        ValidationSet::held_out(&held_out, &config).context("cannot make held-out samples")?;
     for scene in &config.progress.validation_scenes {
         add_scene(&mut validation, Path::new(scene))?;
     }

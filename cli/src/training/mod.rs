@@ -6,6 +6,6 @@ mod scenes;
 mod stop;
 
 pub use self::curves::Curves;
-pub use self::samples::SynthSamples;
+pub use self::samples::Samples;
 pub use self::scenes::add_scene;
 pub use self::stop::Stop;

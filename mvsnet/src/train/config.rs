@@ -19,6 +19,9 @@ pub struct TrainConfig {
     pub sample_threads: usize,
     /// What computes gradients: "cpu" (kernels of our own), "torch" (libtorch on the processor), "cuda" or "cuda:N".
     pub device: String,
+    /// Where samples come from.
+    #[serde(skip_serializing_if = "DataConfig::is_default")]
+    pub data: DataConfig,
     /// The network.
     pub network: NetworkConfig,
     /// How samples are drawn.
@@ -46,6 +49,23 @@ pub struct NetworkConfig {
     /// Which feature network there is.
     #[serde(skip_serializing_if = "FeatureNetwork::is_paper")]
     pub features: FeatureNetwork,
+}
+
+/// Where samples come from: the generator, data sets on disk, or both.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DataConfig {
+    /// The share of samples that are generated; the others come from the data sets, if there are any.
+    pub generated_share: f64,
+    /// Folders of meshes and photographs that the generator puts among what it makes up.
+    pub library: Vec<String>,
+    /// MVSNet or BlendedMVS folders, or folders of such.
+    pub folders: Vec<String>,
+    /// Folders of DTU as it is laid out for training: its 79 training scans, and its 18 validation scans to
+    /// validate on.
+    pub dtu: Vec<String>,
+    /// MVSNet or BlendedMVS folders that are validated on and not trained on.
+    pub validation_folders: Vec<String>,
 }
 
 /// How samples are drawn. Each is drawn from its own number, so a resumed run sees the same ones.
@@ -154,6 +174,7 @@ impl Default for TrainConfig {
             threads: 2,
             sample_threads: 1,
             device: "cpu".to_owned(),
+            data: DataConfig::default(),
             network: NetworkConfig::default(),
             samples: SampleConfig::default(),
             loss: LossConfig::default(),
@@ -161,6 +182,29 @@ impl Default for TrainConfig {
             progress: ProgressConfig::default(),
             about: AboutConfig::default(),
         }
+    }
+}
+
+impl Default for DataConfig {
+    fn default() -> Self {
+        Self {
+            generated_share: 1.0,
+            library: Vec::new(),
+            folders: Vec::new(),
+            dtu: Vec::new(),
+            validation_folders: Vec::new(),
+        }
+    }
+}
+
+impl DataConfig {
+    fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// Whether anything is stored to train on.
+    fn has_data_sets(&self) -> bool {
+        !self.folders.is_empty() || !self.dtu.is_empty()
     }
 }
 
@@ -258,6 +302,12 @@ impl TrainConfig {
             (self.steps > 0, "steps", "at least 1"),
             ((1..=1024).contains(&self.threads), "threads", "from 1 to 1024"),
             ((1..=1024).contains(&self.sample_threads), "sample_threads", "from 1 to 1024"),
+            (
+                share(self.data.generated_share)
+                    && (self.data.generated_share < 1.0) == self.data.has_data_sets(),
+                "data.generated_share",
+                "below 1 with data.folders or data.dtu, and 1 without",
+            ),
             (!sizes.is_empty() && sizes.iter().all(size), "samples.sizes", "multiples of 32 up to 8192"),
             (
                 !views.is_empty() && views.iter().all(|n| (2..=32).contains(n)),

@@ -21,8 +21,8 @@ mod validation;
 
 pub use checkpoint::TrainCheckpointError;
 pub use config::{
-    AboutConfig, ConfigError, LossConfig, NetworkConfig, OptimizerConfig, ProgressConfig, SampleConfig,
-    Schedule, TrainConfig,
+    AboutConfig, ConfigError, DataConfig, LossConfig, NetworkConfig, OptimizerConfig, ProgressConfig,
+    SampleConfig, Schedule, TrainConfig,
 };
 pub use engine::{BatchStatistics, EngineError, Gradient, GradientEngine, GradientOptions, IntervalErrors};
 pub use example::{Example, ExampleError, Recipe, SampleShape};
