@@ -11,7 +11,8 @@ use thiserror::Error;
 use crate::backend::{check_rows, quarter, quarter_camera};
 use crate::bands::{
     FeatureLayers, InferCost, InferSize, Regularization, RegularizationLayers, STEP_ROWS, VolumeTimes,
-    features, predict, refined, refinement_layers, rows_for_depth, rows_for_refinement, step_rows,
+    cache_bytes, features, predict, refined, refinement_layers, rows_for_depth, rows_for_refinement,
+    step_rows,
 };
 use crate::confidence;
 use crate::feature_cache::FeatureCache;
@@ -110,7 +111,7 @@ impl CpuBackend {
             threads: pool.map_err(|source| CpuBackendError::Threads { threads, source })?,
             memory_bytes,
             step_rows: STEP_ROWS,
-            cache: FeatureCache::new(memory_bytes.map_or(CACHE_BYTES, |bytes| (bytes / 4) as usize)),
+            cache: FeatureCache::new(memory_bytes.map_or(CACHE_BYTES, |bytes| cache_bytes(bytes) as usize)),
             times: InferTimes::default(),
         })
     }

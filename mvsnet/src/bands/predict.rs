@@ -113,19 +113,30 @@ impl InferCost {
     }
 }
 
-/// As many rows at a time as the memory allows, at most `most`, at least one.
+/// Bytes of features that are kept for later inferences, of the memory that an inference may hold.
+pub(crate) fn cache_bytes(memory_bytes: u64) -> u64 {
+    memory_bytes / 4
+}
+
+/// As many rows at a time as the memory allows, at most `most`, at least one. Features of earlier inferences may
+/// lie beside those of this one.
 pub(crate) fn step_rows(size: InferSize, threads: usize, memory_bytes: Option<u64>, most: usize) -> usize {
-    let fits = |rows| memory_bytes.is_none_or(|limit| predict(size, threads, rows).bytes <= limit);
+    let fits = |rows| {
+        memory_bytes.is_none_or(|limit| {
+            let others = cache_bytes(limit).saturating_sub(map_bytes(size) as u64);
+            predict(size, threads, rows).bytes + others <= limit
+        })
+    };
     (1..=most).rev().find(|rows| fits(*rows)).unwrap_or(1)
 }
 
 /// The cost of an inference with all its rows, `step_rows` rows of the volume at a time.
 pub(crate) fn predict(size: InferSize, threads: usize, step_rows: usize) -> InferCost {
-    let InferSize { depths, views, .. } = size;
+    let depths = size.depths;
     let (width, height) = size.padded();
     let pixels = width * height;
     let map_pixels = pixels / 16;
-    let maps = views * (width / 4 + 2) * (height / 4 + 2) * 32 * 4;
+    let maps = map_bytes(size);
     let input = 3 * pixels * 4;
     let features = images::features_bytes(width, height) + input;
     let volume = volume_bytes(width / 4, height / 4, depths, step_rows) + map_pixels * PIXEL_BYTES;
@@ -138,6 +149,12 @@ pub(crate) fn predict(size: InferSize, threads: usize, step_rows: usize) -> Infe
     let threads = threads * (THREAD_BYTES + THREAD_BYTES_PER_DEPTH * depths);
     let bytes = FIXED_BYTES + threads + maps + features.max(volume).max(refinement);
     InferCost { bytes: bytes as u64, operations: size.operations() }
+}
+
+/// Bytes of the feature maps of all views.
+fn map_bytes(size: InferSize) -> usize {
+    let (width, height) = size.padded();
+    size.views * (width / 4 + 2) * (height / 4 + 2) * 32 * 4
 }
 
 /// Bytes of the slabs that the 3D network takes from its pool.
@@ -193,6 +210,20 @@ mod tests {
     use crate::kernels::simd::Level;
     use crate::kernels::slab::Pool;
     use crate::{CostMetric, Refinement, Weights, WeightsMetadata};
+
+    #[test]
+    fn steps_and_kept_features_fit_the_memory_together() {
+        let size = InferSize { width: 640, height: 480, depths: 128, views: 3, refined: false };
+        let smallest = predict(size, 2, 1).bytes;
+        let whole = predict(size, 2, STEP_ROWS).bytes;
+        assert_eq!(step_rows(size, 2, Some(2 * whole), STEP_ROWS), STEP_ROWS);
+        for limit in (smallest * 4 / 3..whole).step_by(1 << 20) {
+            let rows = step_rows(size, 2, Some(limit), STEP_ROWS);
+            let kept = cache_bytes(limit).max(map_bytes(size) as u64);
+            let total = predict(size, 2, rows).bytes - map_bytes(size) as u64 + kept;
+            assert!(total <= limit, "{rows} rows and the cache take {total} of {limit}");
+        }
+    }
 
     #[test]
     fn operations_are_those_of_the_layers() {

@@ -160,7 +160,6 @@ impl Pool {
     }
 
     /// Bytes it and its slabs hold.
-    #[cfg(test)]
     pub(crate) fn bytes(&self) -> usize {
         self.bytes.load(Ordering::Relaxed)
     }

@@ -60,6 +60,7 @@ pub enum FeatureNetwork {
 
 impl FeatureNetwork {
     /// Whether it is the paper's, which is what files mean that say nothing of it.
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes it so")]
     pub(crate) fn is_paper(&self) -> bool {
         *self == Self::Paper
     }

@@ -32,6 +32,8 @@ use crate::{FeatureNetwork, Refinement};
 
 /// Parts that the gradient of the cost volume is summed in, whatever the number of threads.
 const STRIPS: usize = 8;
+/// Memory that is kept for the next step, at most: samples of other sizes need slabs of other shapes.
+const MOST_KEPT_BYTES: usize = 4 << 30;
 /// The layer of a feature network that has one, and the last of one that has eight.
 const SINGLE: &str = "feature.feature";
 
@@ -66,7 +68,11 @@ impl GradientEngine for KernelEngine {
             gradients: Tensors::new(),
             measured: Tensors::new(),
         };
-        Ok(self.threads.install(|| run(step, example, options)))
+        let gradient = self.threads.install(|| run(step, example, options));
+        if self.tools.pool.bytes() > MOST_KEPT_BYTES {
+            self.tools.pool = Arc::default();
+        }
+        Ok(gradient)
     }
 }
 
