@@ -1,4 +1,4 @@
-//! Two weights files on every scene of the data beside the checkout, in one table:
+//! Two weights files on generated scenes and on every scene of the data beside the checkout, in one table:
 //! `cargo run --release -p planesweep-tests --example compare_weights -- OUT FIRST SECOND [MAX_SIZE]`.
 //!
 //! A weights file may be a PyTorch checkpoint; it is imported then. Each result stays in OUT/WEIGHTS/SCENE, and
@@ -16,6 +16,10 @@ const NAME: &str = "compare_weights";
 const MAX_SIZE: &str = "640";
 /// The share of the pixels that is compared, in tenths.
 const KEPT_TENTHS: usize = 6;
+/// Seeds of generated courtyards.
+const COURTYARDS: [u64; 2] = [1, 2];
+/// The first seed of the generated samples, and their number; training takes random seeds of 64 bits.
+const SAMPLES: (u64, u64) = (1, 8);
 /// Scenes whose true depth is itself some 2 % off: only the share within 5 % says something.
 const COARSE_TRUTH: [&str; 2] = ["hololens_b", "hololens_c"];
 
@@ -34,11 +38,12 @@ fn main() -> ExitCode {
         "scene", "weights", "conf>0.8", "consistent", "median", "1 %", "5 %", "grey all", "grey"
     );
     let mut wins = [0, 0];
-    for (scene, path) in shared_scenes(NAME, &out) {
+    let shared = shared_scenes(NAME, &out).into_iter().map(|(name, path)| (name.to_owned(), path));
+    for (scene, path) in generated_scenes(&out).into_iter().chain(shared) {
         let figures = contestants.each_ref().map(|(name, weights)| {
-            let result = out.join(name).join(scene);
-            let figures = measure(scene, &path, &result, weights, max_size);
-            println!("{}", figures.row(scene, name));
+            let result = out.join(name).join(&scene);
+            let figures = measure(&scene, &path, &result, weights, max_size);
+            println!("{}", figures.row(&scene, name));
             figures
         });
         for (win, better) in wins.iter_mut().zip(compare(&figures)) {
@@ -54,6 +59,27 @@ fn main() -> ExitCode {
         wins[1]
     );
     ExitCode::SUCCESS
+}
+
+/// Scenes of seeds that nothing is trained on: courtyards of ten views, which the training's generator does not
+/// make, and samples of that generator, of which one view has its true depth.
+fn generated_scenes(out: &Path) -> Vec<(String, PathBuf)> {
+    let mut scenes = Vec::new();
+    for seed in COURTYARDS {
+        let folder = out.join(format!("scenes/courtyard_{seed}"));
+        let _ = run(["synth", text(&folder), "--seed", &seed.to_string()]).expect_code(0);
+        scenes.push((format!("courtyard_{seed}"), folder));
+    }
+    let samples = out.join("scenes/samples");
+    let (first, count) = SAMPLES;
+    let (seed, count_text) = (first.to_string(), count.to_string());
+    let shape = ["--views", "5", "--width", "640", "--height", "480"];
+    let made = ["synth", text(&samples), "--training", &count_text, "--seed", &seed];
+    let _ = run(made.into_iter().chain(shape)).expect_code(0);
+    scenes.extend(
+        (first..first + count).map(|seed| (format!("sample_{seed}"), samples.join(format!("{seed:08}")))),
+    );
+    scenes
 }
 
 /// The name of a weights file, and the file itself, imported when it is a checkpoint.
@@ -94,9 +120,10 @@ fn measure(name: &str, scene: &Path, result: &Path, weights: &Path, max_size: &s
     let at_kept = |curve: &Value, steps: usize| curve[steps * KEPT_TENTHS / 10 - 1].clone();
     let consistent = at_kept(&evaluate("consistency")["curve"], 10)["consistent"].as_f64();
     let photometric = evaluate("photometric")["mean"]["curve"].clone();
-    let truth = scene.join("depth_gt");
-    let errors = if truth.exists() {
-        at_kept(&json(&run(["evaluate", "depth", text(result), text(&truth), "--json"]))["mean"]["curve"], 20)
+    let truths = ["depth_gt", "rendered_depth_maps"].map(|folder| scene.join(folder));
+    let truth = truths.iter().find(|folder| folder.exists());
+    let errors = if let Some(truth) = truth {
+        at_kept(&json(&run(["evaluate", "depth", text(result), text(truth), "--json"]))["mean"]["curve"], 20)
     } else {
         Value::Null
     };
