@@ -1,4 +1,4 @@
-//! How good a result is: depth error, DTU distances, Tanks and Temples F-score.
+//! How good a result is: depth error, DTU distances, Tanks and Temples F-score, ETH3D accuracy and completeness.
 
 #![warn(missing_docs)]
 
@@ -6,6 +6,7 @@ mod depth;
 mod depth_means;
 mod down_sample;
 pub mod dtu;
+pub mod eth3d;
 mod nearest;
 mod photometric;
 mod similarity;

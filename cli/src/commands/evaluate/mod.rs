@@ -3,6 +3,7 @@
 mod consistency;
 mod depth;
 mod dtu;
+mod eth3d;
 mod figures;
 mod photometric;
 mod tnt;
@@ -31,6 +32,8 @@ pub enum EvaluateCommand {
     Dtu(DtuArgs),
     /// Compare a cloud with a laser scan as the Tanks and Temples benchmark does: precision, recall, F-score.
     Tnt(TntArgs),
+    /// Compare a cloud with laser scans as the ETH3D benchmark does: accuracy, completeness, F1 at several tolerances.
+    Eth3d(eth3d::Eth3dArgs),
 }
 
 /// Measures.
@@ -41,6 +44,7 @@ pub fn run(command: &EvaluateCommand) -> Result<Outcome> {
         EvaluateCommand::Consistency(args) => consistency::run(args),
         EvaluateCommand::Dtu(args) => dtu::run(args),
         EvaluateCommand::Tnt(args) => tnt::run(args),
+        EvaluateCommand::Eth3d(args) => eth3d::run(args),
     }
 }
 
