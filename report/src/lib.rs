@@ -7,7 +7,6 @@
 
 mod cloud_picture;
 mod colormap;
-mod curve_plot;
 mod depth_histogram;
 mod event_file;
 mod font;
@@ -20,7 +19,6 @@ mod run_report;
 
 pub use cloud_picture::render_cloud;
 pub use colormap::{confidence_color, depth_color, error_color};
-pub use curve_plot::{Curve, plot_curves};
 pub use depth_histogram::plot_depth_histogram;
 pub use event_file::{event_file_start, scalar_event};
 pub use html::{Pictures, render_html};

@@ -7,7 +7,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, Result};
 use planesweep_mvsnet::train::{IntervalErrors, StepReport, TrainConfig, Validation};
-use planesweep_report::{Curve, encode_png, event_file_start, plot_curves, scalar_event};
+use planesweep_report::{Line, LinePlot, draw_lines, encode_png, event_file_start, scalar_event};
 use planesweep_scene::write_atomically;
 
 const STEPS: &str = "curve.csv";
@@ -144,23 +144,22 @@ impl Curves {
     /// Draws loss and errors.
     pub fn draw(&self) -> Result<()> {
         let training = |column: usize| points(&self.steps, column, None);
-        let loss = Curve { name: "LOSS".to_owned(), points: training(1) };
-        self.write_picture("loss.png", &plot_curves("LOSS IN INTERVALS", &[loss], None))?;
-        let mut curves = vec![
-            Curve { name: "< 1".to_owned(), points: training(3) },
-            Curve { name: "< 3".to_owned(), points: training(4) },
-        ];
+        self.write_plot("loss.png", "loss", "intervals", &[("loss".to_owned(), training(1))])?;
+        let mut curves = vec![("< 1".to_owned(), training(3)), ("< 3".to_owned(), training(4))];
         let groups: std::collections::BTreeSet<&str> =
             self.validations.iter().filter_map(|line| line.split(',').nth(1)).collect();
         for group in groups {
             let points = points(&self.validations, 3, Some(group));
-            curves.push(Curve { name: format!("{} < 1", group.replace('_', " ")), points });
+            curves.push((format!("{} < 1", group.replace('_', " ")), points));
         }
-        self.write_picture("errors.png", &plot_curves("SHARE OF ERRORS", &curves, Some(1.0)))
+        self.write_plot("errors.png", "errors in intervals", "share", &curves)
     }
 
-    fn write_picture(&self, name: &str, picture: &planesweep_scene::Raster<[u8; 3]>) -> Result<()> {
-        write(&self.folder.join(name), &encode_png(picture)?)
+    /// Draws curves, each with its name, over the steps.
+    fn write_plot(&self, file: &str, title: &str, y_label: &str, curves: &[NamedCurve]) -> Result<()> {
+        let lines: Vec<Line> = curves.iter().map(|(name, points)| Line { name, points }).collect();
+        let plot = LinePlot { title, x_label: "step", y_label, lines: &lines, mark: None };
+        write(&self.folder.join(file), &encode_png(&draw_lines(&plot))?)
     }
 
     fn write_event(&mut self, step: u64, scalars: &[(&str, f64)]) -> Result<()> {
@@ -194,12 +193,16 @@ fn lines_until(path: &Path, step: u64) -> Vec<String> {
     text.lines().filter(|line| of(line).is_some_and(|at| at <= step)).map(str::to_owned).collect()
 }
 
-/// (step, value) of a column, of the lines of one group.
-fn points(lines: &[String], column: usize, group: Option<&str>) -> Vec<(u64, f64)> {
+/// A curve's name, and its points: (step, value).
+type NamedCurve = (String, Vec<(f64, f64)>);
+
+/// (step, value) of a column, of the lines of one group; values that are no numbers are left out.
+fn points(lines: &[String], column: usize, group: Option<&str>) -> Vec<(f64, f64)> {
     let point = |line: &String| {
         let cells: Vec<&str> = line.split(',').collect();
+        let number = |cell: Option<&&str>| cell?.parse().ok().filter(|value: &f64| value.is_finite());
         let mine = group.is_none_or(|group| cells.get(1) == Some(&group));
-        if mine { Some((cells.first()?.parse().ok()?, cells.get(column)?.parse().ok()?)) } else { None }
+        if mine { Some((number(cells.first())?, number(cells.get(column))?)) } else { None }
     };
     lines.iter().filter_map(point).collect()
 }
