@@ -18,6 +18,13 @@ pub struct TokenArgs {
 }
 
 impl TokenArgs {
+    /// The options of another command that call the coordinator at `url` with the same token.
+    pub fn passed_on(&self, url: &str) -> Vec<String> {
+        let file = self.token_file.iter();
+        let token = file.flat_map(|path| ["--token-file".to_owned(), path.to_string_lossy().into_owned()]);
+        ["--coordinator".to_owned(), url.to_owned()].into_iter().chain(token).collect()
+    }
+
     /// The token, if there is one.
     pub fn read(&self) -> Result<Option<String>> {
         let Some(path) = &self.token_file else {

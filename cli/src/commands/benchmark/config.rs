@@ -24,7 +24,7 @@ pub struct BenchmarkConfig {
     pub weights: Option<PathBuf>,
     /// Another list of scenes than the preset's.
     pub names: Option<Vec<String>>,
-    /// Further options of `reconstruct`, such as where a coordinator is; they override the preset's.
+    /// Further options of `reconstruct` (of `submit`, with a coordinator); they override the preset's.
     #[serde(default)]
     pub options: Vec<String>,
     /// Thresholds of scenes that the benchmark sets none for, in metres.
@@ -73,8 +73,8 @@ impl BenchmarkConfig {
         }
     }
 
-    /// The arguments of `reconstruct` for a scene.
-    pub fn arguments(&self, name: &str) -> Vec<String> {
+    /// The arguments for a scene of `command`, `reconstruct` or `submit`; `more` go before the file's options.
+    pub fn arguments(&self, name: &str, command: &str, more: &[String]) -> Vec<String> {
         let text = |path: &Path| path.to_string_lossy().into_owned();
         let settings: &[&str] = match self.preset {
             // N = 5, W = 1920, D = 256; ranges from the sparse points (paper, section 5.2).
@@ -95,11 +95,11 @@ impl BenchmarkConfig {
                 "uniform",
             ],
         };
-        let mut arguments = vec!["planesweep".to_owned(), "reconstruct".to_owned()];
+        let mut arguments = vec!["planesweep".to_owned(), command.to_owned()];
         arguments.extend([text(&self.scenes.join(name)), "--out".to_owned(), text(&self.out.join(name))]);
         arguments.extend(settings.iter().map(|word| (*word).to_owned()));
         arguments.extend(self.weights.iter().flat_map(|path| ["--weights".to_owned(), text(path)]));
-        arguments.extend(self.options.iter().cloned());
+        arguments.extend(more.iter().chain(&self.options).cloned());
         arguments
     }
 }
@@ -124,7 +124,7 @@ mod tests {
         let config = BenchmarkConfig::read(&path).expect("a benchmark");
         assert_eq!(config.scenes, folder.path().join("scans"));
         assert_eq!((config.names().len(), config.names()[0].as_str()), (22, "scan1"));
-        let arguments = config.arguments("scan1");
+        let arguments = config.arguments("scan1", "reconstruct", &[]);
         assert!(arguments.contains(&"/results/scan1".to_owned()));
         assert_eq!(arguments[arguments.len() - 2..], ["--depths", "64"]);
     }

@@ -15,8 +15,8 @@ use serde_json::{Value, json};
 
 use self::config::{BenchmarkConfig, INTERMEDIATE, Preset};
 use super::evaluate::{self, DtuArgs, EvaluateCommand, TntArgs};
-use super::reconstruct;
-use crate::args::{Cli, Command};
+use super::{reconstruct, submit};
+use crate::args::{Cli, Command, TokenArgs};
 use crate::console::{Outcome, table};
 
 /// Arguments of `benchmark`.
@@ -30,6 +30,11 @@ use crate::console::{Outcome, table};
 pub struct BenchmarkArgs {
     /// The benchmark.
     pub config: PathBuf,
+    /// Submit the scenes to this coordinator, as `submit` does, instead of starting workers here.
+    #[arg(long, value_name = "URL")]
+    pub coordinator: Option<String>,
+    #[command(flatten)]
+    pub token: TokenArgs,
 }
 
 /// A scene that was tried.
@@ -47,7 +52,7 @@ pub fn run(args: &BenchmarkArgs, verbose: u8) -> Result<Outcome> {
     for name in config.names() {
         eprintln!("{name}");
         // One scene that fails does not end a run of hours; it is named at the end.
-        let reconstructed = reconstruct_scene(&config, &name, verbose).map_err(|error| {
+        let reconstructed = reconstruct_scene(args, &config, &name, verbose).map_err(|error| {
             eprintln!("{name}: {error:#}");
             format!("{error:#}")
         });
@@ -72,15 +77,25 @@ pub fn run(args: &BenchmarkArgs, verbose: u8) -> Result<Outcome> {
     Ok(Outcome { text: table(&rows), value, skipped_views: tried.iter().any(is_partial) })
 }
 
-fn reconstruct_scene(config: &BenchmarkConfig, name: &str, verbose: u8) -> Result<Outcome> {
+fn reconstruct_scene(
+    args: &BenchmarkArgs,
+    config: &BenchmarkConfig,
+    name: &str,
+    verbose: u8,
+) -> Result<Outcome> {
+    let arguments = match &args.coordinator {
+        None => config.arguments(name, "reconstruct", &[]),
+        Some(url) => config.arguments(name, "submit", &args.token.passed_on(url)),
+    };
     // An option that comes twice counts as it comes last, so that the file overrides the preset.
     let command = Cli::command().args_override_self(true);
     let cli = command
-        .try_get_matches_from(config.arguments(name))
+        .try_get_matches_from(arguments)
         .and_then(|matches| Cli::from_arg_matches(&matches))
         .context("cannot use the options of the benchmark")?;
     match cli.command {
         Command::Reconstruct(args) => reconstruct::run(&args, true, verbose),
+        Command::Submit(args) => submit::run(&args, true),
         _ => bail!("the options of the benchmark are those of another command"),
     }
 }
