@@ -128,7 +128,9 @@ fn of_mvsnet_folder(folder: &Path, masks: Option<&Path>, options: &ReadOptions) 
         scene.points = planesweep_scene::SparsePoints::default();
     }
     let ranking = rank_sources(&scene, &scene.undistorted_cameras(), &ranges);
-    Ok(Found { files, ranking, warnings: scene.warnings, without })
+    let left_out = scene.skipped.iter().map(|(view, reason)| format!("view {view} is left out: {reason}"));
+    let warnings = scene.warnings.iter().map(ToString::to_string).chain(left_out).collect();
+    Ok(Found { files, ranking, warnings, without })
 }
 
 impl DepthMaps {

@@ -63,6 +63,9 @@ impl Prepared {
         for warning in &input.scene.warnings {
             eprintln!("warning: {warning}");
         }
+        for skipped in &input.skipped {
+            eprintln!("warning: view {} is left out: {}", skipped.view, skipped.reason);
+        }
         let plan = timed(stages, "plan", || Ok(plan(&input.scene, options)))?;
         if plan.views.is_empty() {
             bail!("no view can be reconstructed; `planesweep inspect {}` says why", scene.display());

@@ -87,9 +87,8 @@ pub fn checkup(scene: &Scene, left_out: &BTreeMap<String, String>, plan: &Plan) 
     lost(scene, left_out, plan, &mut findings);
     weak(scene, plan, &seen, &mut findings);
     for warning in &scene.warnings {
-        let advice = "nothing, if that is what the files mean".to_owned();
-        let views = scene.views.len();
-        findings.push(Finding { severity: Severity::Note, views, what: warning.clone(), advice });
+        let (what, advice) = (warning.what.clone(), warning.advice.to_owned());
+        findings.push(Finding { severity: Severity::Note, views: scene.views.len(), what, advice });
     }
     // Stable: within one severity and number of views the order is that of the checks.
     findings.sort_by_key(|finding| (finding.severity, std::cmp::Reverse(finding.views)));
@@ -270,7 +269,7 @@ fn weak(scene: &Scene, plan: &Plan, seen: &BTreeMap<ViewId, Seen>, findings: &mu
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector3;
-    use planesweep_scene::{Camera, Distortion, Intrinsics, Pose, SparsePoints};
+    use planesweep_scene::{Camera, Distortion, Intrinsics, Pose, SparsePoints, Warning};
 
     use super::*;
     use crate::{PlanOptions, plan};
@@ -318,7 +317,7 @@ mod tests {
         let mut stranger = scene.views[&ViewId(3)].clone();
         (stranger.id, stranger.name) = (ViewId(9), "9.jpg".to_owned());
         scene.views.insert(stranger.id, stranger);
-        scene.warnings.push("something odd".to_owned());
+        scene.warnings.push(Warning::new("something odd".to_owned(), "look at it"));
         let found = findings(&scene, &PlanOptions { views: 5, ..PlanOptions::default() });
         assert!(found.is_sorted_by_key(|(severity, views, _)| (*severity, std::cmp::Reverse(*views))));
         let expected = [

@@ -46,7 +46,7 @@ pub use read::{
     DepthLine, NameError, PixelCentre, ReadError, ReadOptions, ResolveError, SceneFormat, ViewError,
     read_mvsnet_cam, read_mvsnet_pairs, read_scene, resolve_inside, safe_name,
 };
-pub use scene::{DepthRange, Scene, SourceScore, SparsePoints, View};
+pub use scene::{DepthRange, Scene, SourceScore, SparsePoints, View, Warning};
 pub use stitch::StitchError;
 pub use training_sample::TrainingSample;
 pub use undistort::undistorted_intrinsics;

@@ -1,6 +1,7 @@
 //! A scene: what every reader makes, and all that planning needs.
 
 use std::collections::{BTreeMap, HashSet};
+use std::fmt;
 use std::path::PathBuf;
 
 use nalgebra::Point3;
@@ -18,9 +19,31 @@ pub struct Scene {
     /// Source views by reference view, best first, when the scene's files name them (pair.txt).
     pub pairs: BTreeMap<ViewId, Vec<SourceScore>>,
     /// What was odd about the files but had a clear meaning, in the order of reading.
-    pub warnings: Vec<String>,
+    pub warnings: Vec<Warning>,
     /// Views that were left out, by name, each with the reason.
     pub skipped: BTreeMap<String, String>,
+}
+
+/// Something odd about a scene's files that had a clear meaning.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Warning {
+    /// What is odd.
+    pub what: String,
+    /// What to do about it.
+    pub advice: &'static str,
+}
+
+impl Warning {
+    /// What is odd, and what to do about it.
+    pub fn new(what: String, advice: &'static str) -> Self {
+        Self { what, advice }
+    }
+}
+
+impl fmt::Display for Warning {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(&self.what)
+    }
 }
 
 /// One photograph with its camera.

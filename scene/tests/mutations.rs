@@ -129,12 +129,14 @@ fn scenes(folder: &Path) -> Vec<(PathBuf, Vec<PathBuf>)> {
     let camera = "20 0.1 0.2\n1 0 0\n0 1 0\n0 0 1\n1 2 3\n";
     let bundle = format!("# Bundle file v0.3\n2 1\n{camera}{camera}1 2 3\n4 5 6\n2 0 1 2 3 1 1 2 3\n");
     by_hand("bundler", "bundle.out", bundle.as_bytes());
-    by_hand("openmvs", "scene.mvs", &openmvs());
+    by_hand("openmvs 3", "scene.mvs", &openmvs(3));
+    by_hand("openmvs 7", "scene.mvs", &openmvs(7));
     scenes
 }
 
-fn openmvs() -> Vec<u8> {
-    let mut bytes = b"MVSI\x03\0\0\0\0\0\0\0".to_vec();
+/// OpenMVS's file in a version of it.
+fn openmvs(version: u32) -> Vec<u8> {
+    let mut bytes = [*b"MVSI", version.to_le_bytes(), [0; 4]].concat();
     let count = |bytes: &mut Vec<u8>, n: u64| bytes.extend(n.to_le_bytes());
     let floats =
         |bytes: &mut Vec<u8>, values: &[f64]| bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
@@ -145,6 +147,10 @@ fn openmvs() -> Vec<u8> {
     count(&mut bytes, 1);
     count(&mut bytes, 1);
     bytes.push(b'c');
+    if version > 3 {
+        count(&mut bytes, 3);
+        bytes.extend(b"RGB");
+    }
     bytes.extend([16_u32, 12].iter().flat_map(|v| v.to_le_bytes()));
     floats(&mut bytes, &[20.0, 0.0, 8.0, 0.0, 20.0, 6.0, 0.0, 0.0, 1.0]);
     floats(&mut bytes, &identity);
@@ -159,7 +165,17 @@ fn openmvs() -> Vec<u8> {
         let name = format!("images/{k}.png");
         count(&mut bytes, name.len() as u64);
         bytes.extend(name.bytes());
+        if version > 4 {
+            count(&mut bytes, 4);
+            bytes.extend(b"mask");
+        }
         bytes.extend([0, 0, k, k].iter().flat_map(|v| v.to_le_bytes()));
+        if version > 6 {
+            bytes.extend([0.5_f32, 1.0, 2.0].iter().flat_map(|v| v.to_le_bytes()));
+            count(&mut bytes, 1);
+            bytes.extend([1 - k, 1].iter().flat_map(|v| v.to_le_bytes()));
+            bytes.extend([1.0_f32, 0.2, 0.9, 7.5].iter().flat_map(|v| v.to_le_bytes()));
+        }
     }
     count(&mut bytes, 1);
     bytes.extend([1.0_f32, 2.0, 3.0].iter().flat_map(|v| v.to_le_bytes()));
@@ -178,6 +194,7 @@ fn every_reader_answers_to_every_mutation() {
     for (scene, files) in &scenes {
         let read = read_scene(scene, &ReadOptions::default()).expect("whole");
         assert_eq!(read.views.len(), 2, "{}", scene.display());
+        assert!(read.points.iter().all(|(_, track)| track.len() == 2), "{}", scene.display());
         for file in files {
             let whole = fs::read(file).expect("read");
             let mut runner = proptest::test_runner::TestRunner::new(ProptestConfig {

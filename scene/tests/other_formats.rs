@@ -67,7 +67,7 @@ fn openmvg_is_read_in_old_and_new_nesting_with_types_named_once() {
     let k = scene.views[&ViewId(5)].camera.intrinsics;
     assert_eq!((k.fx, k.fy, k.cx, k.cy, k.width), (21.0, 21.0, 8.0, 6.0, 16));
     assert_eq!(scene.points.iter().next().expect("a point").1, [ViewId(4), ViewId(7)]);
-    assert!(scene.warnings.len() == 1 && scene.warnings[0].starts_with("1 views of"), "{:?}", scene.warnings);
+    assert!(scene.warnings.len() == 1 && scene.warnings[0].what.starts_with("1 views of"), "{:?}", scene.warnings);
 }
 
 #[test]
@@ -122,7 +122,7 @@ fn nerfstudio_is_read_with_cameras_of_the_file_and_of_frames() {
         scene.views[&ViewId(2)].distortion,
         Distortion::Fisheye { k1: 0.1, k2: 0.2, k3: 0.0, k4: 0.0 }
     );
-    assert!(scene.points.is_empty() && scene.warnings[0].contains("its points say not"));
+    assert!(scene.points.is_empty() && scene.warnings[0].what.contains("its points say not"));
 
     let angle = r#"{"camera_angle_x": 1.5707963267948966, "frames": [{"file_path": "images/1.png",
         "transform_matrix": [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]}]}"#;
@@ -252,7 +252,7 @@ fn openmvs_agrees_with_colmap_about_sceaux() {
     };
     assert!(refused(b"MVSX").contains("does not start with MVSI"));
     assert!(
-        refused(&[b"MVSI".as_slice(), &[7, 0, 0, 0], &bytes[8..]].concat()).contains("version 7 is newer")
+        refused(&[b"MVSI".as_slice(), &[8, 0, 0, 0], &bytes[8..]].concat()).contains("version 8 is newer")
     );
     for length in [0, 3, 7, 11, 40, 300, 2000, 100_000] {
         let message = refused(&bytes[..length]);

@@ -69,6 +69,9 @@ pub fn run(args: &ConvertArgs) -> Result<Outcome> {
     for warning in &scene.warnings {
         text.push_str(&format!("warning: {warning}\n"));
     }
+    for (view, reason) in &scene.skipped {
+        text.push_str(&format!("left out: view {view}: {reason}\n"));
+    }
     for note in &notes {
         text.push_str(&format!("{note}\n"));
     }
@@ -78,7 +81,7 @@ pub fn run(args: &ConvertArgs) -> Result<Outcome> {
     let value = json!({
         "out": args.out,
         "views": views,
-        "warnings": scene.warnings,
+        "warnings": scene.warnings.iter().map(ToString::to_string).collect::<Vec<_>>(),
         "added": notes,
         "not_held": held.losses,
         "resampled": held.resampled,

@@ -351,7 +351,7 @@ fn report(
             .iter()
             .map(|s| SkippedView { name: s.view.clone(), reason: s.reason.clone() })
             .collect(),
-        warnings: run.prepared.input.scene.warnings.clone(),
+        warnings: run.prepared.input.scene.warnings.iter().map(ToString::to_string).collect(),
         totals: Totals { points, wall_seconds: begun.elapsed().as_secs_f64() },
     }
 }

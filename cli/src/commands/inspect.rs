@@ -83,7 +83,7 @@ pub fn run(args: &InspectArgs) -> Result<Outcome> {
         "scene": args.scene,
         "views": scene.views.len(),
         "sparse_points": scene.points.len(),
-        "warnings": scene.warnings,
+        "warnings": scene.warnings.iter().map(ToString::to_string).collect::<Vec<_>>(),
         "skipped": skipped,
         "findings": findings,
         "plan": plan,

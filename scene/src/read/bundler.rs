@@ -12,7 +12,7 @@ use super::names::resolve_inside;
 use super::points::PointsInto;
 use super::views::{Candidate, Geometry, admit};
 use super::{ReadError, ReadOptions, ViewError, inconsistent, read_text, relative_name};
-use crate::{CameraError, Distortion, Intrinsics, Pose, Scene, ViewId, image_size};
+use crate::{CameraError, Distortion, Intrinsics, Pose, Scene, ViewId, image_size, Warning};
 
 /// Names of the list of images, after the name of the bundle file itself.
 const LISTS: [&str; 3] = ["list.txt", "list_focal.txt", "image_list.txt"];
@@ -87,7 +87,10 @@ pub(super) fn read(file: &Path, options: &ReadOptions) -> Result<Scene, ReadErro
     }
     let unplaced = cameras - candidates.len();
     if unplaced > 0 {
-        scene.warnings.push(format!("{unplaced} photographs of {} have no camera", file.display()));
+        scene.warnings.push(Warning::new(
+            format!("{unplaced} photographs of {} have no camera", file.display()),
+            "add photographs between them and the others, and run the bundle adjustment again, if they are needed",
+        ));
     }
     admit(candidates, file, &images, options, &mut scene)?;
     let mut into = PointsInto::new(&mut scene);

@@ -7,8 +7,8 @@ use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 
 use super::points::PointsInto;
 use super::views::{Candidate, Geometry, admit};
-use super::{ReadError, ReadOptions, ViewError, colmap_binary, colmap_text, inconsistent, read_text};
-use crate::{CameraError, Distortion, Intrinsics, Pose, Scene, ViewId};
+use super::{ReadError, ReadOptions, ViewError, colmap_binary, colmap_text, inconsistent};
+use crate::{CameraError, Distortion, Intrinsics, Pose, Scene, ViewId, Warning};
 
 /// COLMAP's camera models; a model's number in binary files is its place here. All are known, so
 /// that files parse; [`lens`] says which can be used.
@@ -88,20 +88,21 @@ pub(super) fn read(root: &Path, model: &Path, options: &ReadOptions) -> Result<S
     }
     let mut scene = Scene::default();
     if root.join("sparse/1").is_dir() && model.ends_with("0") {
-        scene.warnings.push("sparse/ holds several models; only sparse/0 is read".to_owned());
+        scene.warnings.push(Warning::new(
+            "sparse/ holds several models; only sparse/0 is read".to_owned(),
+            "compare the models' numbers of images; for another one make a folder with images/ and that model in sparse/",
+        ));
     }
     let binary = is_binary(model);
     let file = |stem: &str| model.join(format!("{stem}.{}", if binary { "bin" } else { "txt" }));
 
     let path = file("cameras");
-    let cameras =
-        if binary { colmap_binary::cameras(&path) } else { colmap_text::cameras(&path, &read_text(&path)?) };
+    let cameras = if binary { colmap_binary::cameras(&path) } else { colmap_text::cameras(&path) };
     let cameras =
         by_id(cameras?, |camera| camera.id, |id| inconsistent(&path, format!("camera {id} twice")))?;
 
     let path = file("images");
-    let images =
-        if binary { colmap_binary::images(&path) } else { colmap_text::images(&path, &read_text(&path)?) };
+    let images = if binary { colmap_binary::images(&path) } else { colmap_text::images(&path) };
     let images = by_id(images?, |image| image.id, |id| inconsistent(&path, format!("image {id} twice")))?;
     let ids: HashSet<u32> = images.keys().copied().collect();
     let candidates: Vec<_> = images
@@ -118,14 +119,17 @@ pub(super) fn read(root: &Path, model: &Path, options: &ReadOptions) -> Result<S
 
     let path = file("points3D");
     if !path.is_file() {
-        scene.warnings.push(format!("{} is missing: there are no sparse points", path.display()));
+        scene.warnings.push(Warning::new(
+            format!("{} is missing: there are no sparse points", path.display()),
+            "copy it from where the model was made: source views and depth ranges come from it",
+        ));
         return Ok(scene);
     }
     let mut points = PointsInto::new(&mut scene);
     if binary {
         colmap_binary::points(&path, &ids, &mut points)?;
     } else {
-        colmap_text::points(&path, &read_text(&path)?, &ids, &mut points)?;
+        colmap_text::points(&path, &ids, &mut points)?;
     }
     points.finish();
     Ok(scene)

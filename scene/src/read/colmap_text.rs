@@ -1,12 +1,64 @@
-//! COLMAP's text models: cameras.txt, images.txt, points3D.txt.
+//! COLMAP's text models: cameras.txt, images.txt, points3D.txt, read line by line: a model may be larger
+//! than the memory.
 
 use std::collections::HashSet;
-use std::path::Path;
+use std::fs::File;
+use std::io::{self, BufRead, BufReader};
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use super::ReadError;
 use super::colmap::{CameraModel, RawCamera, RawImage};
 use super::points::PointsInto;
+
+/// The lines of a file not read yet.
+struct Lines {
+    path: PathBuf,
+    reader: BufReader<File>,
+    /// The line that was read last, counted from 1.
+    number: usize,
+    text: Vec<u8>,
+}
+
+impl Lines {
+    fn open(path: &Path) -> Result<Self, ReadError> {
+        let file = File::open(path).map_err(|source| ReadError::Io { path: path.to_owned(), source })?;
+        let reader = BufReader::with_capacity(1 << 18, file);
+        Ok(Self { path: path.to_owned(), reader, number: 0, text: Vec::new() })
+    }
+
+    /// The next line with something in it that is no comment; `None` at the end.
+    fn record(&mut self) -> Result<Option<Line<'_>>, ReadError> {
+        loop {
+            self.text.clear();
+            let length = self.reader.read_until(b'\n', &mut self.text);
+            if length.map_err(|source| self.io_error(source))? == 0 {
+                return Ok(None);
+            }
+            self.number += 1;
+            let text = self.text.trim_ascii();
+            if !text.is_empty() && !text.starts_with(b"#") {
+                break;
+            }
+        }
+        let (path, number) = (self.path.as_path(), self.number);
+        match str::from_utf8(&self.text) {
+            Ok(rest) => Ok(Some(Line { path, number, rest })),
+            Err(_) => Err(Line { path, number, rest: "" }.error("not UTF-8")),
+        }
+    }
+
+    /// Passes over a line, however long, without holding it.
+    fn skip(&mut self) -> Result<(), ReadError> {
+        let length = self.reader.skip_until(b'\n').map_err(|source| self.io_error(source))?;
+        self.number += usize::from(length > 0);
+        Ok(())
+    }
+
+    fn io_error(&self, source: io::Error) -> ReadError {
+        ReadError::Io { path: self.path.clone(), source }
+    }
+}
 
 /// One line, taken apart from the left.
 struct Line<'a> {
@@ -45,18 +97,10 @@ impl<'a> Line<'a> {
     }
 }
 
-fn lines<'a>(path: &'a Path, text: &'a str) -> impl Iterator<Item = Line<'a>> {
-    text.lines().enumerate().map(move |(k, rest)| Line { path, number: k + 1, rest })
-}
-
-fn is_record(line: &Line) -> bool {
-    let text = line.rest.trim_ascii();
-    !text.is_empty() && !text.starts_with('#')
-}
-
-pub(super) fn cameras(path: &Path, text: &str) -> Result<Vec<RawCamera>, ReadError> {
+pub(super) fn cameras(path: &Path) -> Result<Vec<RawCamera>, ReadError> {
+    let mut lines = Lines::open(path)?;
     let mut cameras = Vec::new();
-    for mut line in lines(path, text).filter(is_record) {
+    while let Some(mut line) = lines.record()? {
         let id = line.next("camera id")?;
         let name: String = line.next("camera model")?;
         let model = CameraModel::by_name(&name)
@@ -71,13 +115,10 @@ pub(super) fn cameras(path: &Path, text: &str) -> Result<Vec<RawCamera>, ReadErr
     Ok(cameras)
 }
 
-pub(super) fn images(path: &Path, text: &str) -> Result<Vec<RawImage>, ReadError> {
+pub(super) fn images(path: &Path) -> Result<Vec<RawImage>, ReadError> {
+    let mut lines = Lines::open(path)?;
     let mut images = Vec::new();
-    let mut lines = lines(path, text);
-    while let Some(mut line) = lines.next() {
-        if !is_record(&line) {
-            continue;
-        }
+    while let Some(mut line) = lines.record()? {
         let id = line.next("image id")?;
         let quaternion = line.numbers("quaternion")?;
         let translation = line.numbers("translation")?;
@@ -85,21 +126,17 @@ pub(super) fn images(path: &Path, text: &str) -> Result<Vec<RawImage>, ReadError
         // The name may have spaces: it is the rest of the line.
         let name = line.rest.trim_ascii().to_owned();
         images.push(RawImage { id, quaternion, translation, camera, name });
-        // The line after it lists observations, and is empty where there are none.
-        lines.next();
+        // The line after it lists observations, megabytes of them, and is empty where there are none.
+        lines.skip()?;
     }
     Ok(images)
 }
 
 /// Reads each point with the ids of the images that see it. An id that is not in `images` is an error.
-pub(super) fn points(
-    path: &Path,
-    text: &str,
-    images: &HashSet<u32>,
-    points: &mut PointsInto,
-) -> Result<(), ReadError> {
+pub(super) fn points(path: &Path, images: &HashSet<u32>, points: &mut PointsInto) -> Result<(), ReadError> {
+    let mut lines = Lines::open(path)?;
     let mut track = Vec::new();
-    for mut line in lines(path, text).filter(is_record) {
+    while let Some(mut line) = lines.record()? {
         let id: u64 = line.next("point id")?;
         let position = line.numbers::<3>("position")?;
         line.numbers::<4>("colour or error")?;

@@ -197,7 +197,7 @@ pub enum ViewError {
 
 /// Reads a scene: a folder in one of the known layouts, or the file that describes it.
 ///
-/// Views whose image is missing or has no readable header are left out with a warning; their ids
+/// Views whose image is missing or has no readable header are skipped and named; their ids
 /// vanish from tracks and pairs too.
 pub fn read_scene(path: &Path, options: &ReadOptions) -> Result<Scene, ReadError> {
     let found = detect::find(path, options.format)?;

@@ -9,7 +9,7 @@ use nalgebra::{Matrix3, Vector3};
 use super::pairs::parse_pairs;
 use super::views::{Candidate, Geometry, admit};
 use super::{DepthLine, PixelCentre, ReadError, ReadOptions, ViewError, read_text};
-use crate::{Camera, DepthRange, Distortion, Intrinsics, Pose, Scene, SourceScore, ViewId};
+use crate::{Camera, DepthRange, Distortion, Intrinsics, Pose, Scene, SourceScore, ViewId, Warning};
 
 /// The number of planes and the factor on the interval that files of "minimum, interval" were made for.
 const DEFAULT_PLANES: u32 = 192;
@@ -45,7 +45,9 @@ pub(super) fn read(root: &Path, options: &ReadOptions) -> Result<Scene, ReadErro
         let path = cams.join(&file);
         let geometry = parse_camera(&read_text(&path)?, options).map_err(|error| error.at(path)).map(
             |(geometry, warning)| {
-                scene.warnings.extend(warning.map(|warning| format!("cams/{file}: {warning}")));
+                let advice = "mend the line (least depth, interval, number of planes), or give --depth-range NEAR,FAR";
+                let what = warning.map(|warning| format!("cams/{file}: {warning}"));
+                scene.warnings.extend(what.map(|what| Warning::new(what, advice)));
                 geometry
             },
         );

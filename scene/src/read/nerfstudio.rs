@@ -13,7 +13,7 @@ use super::json::{json_at, number};
 use super::names::resolve_inside;
 use super::views::{Candidate, Geometry, admit};
 use super::{ReadError, ReadOptions, ViewError, inconsistent, relative_name};
-use crate::{Distortion, Intrinsics, Pose, Scene, ViewId, image_size};
+use crate::{Distortion, Intrinsics, Pose, Scene, ViewId, image_size, Warning};
 
 #[derive(Deserialize)]
 struct Transforms {
@@ -49,7 +49,8 @@ pub(super) fn read(file: &Path, options: &ReadOptions) -> Result<Scene, ReadErro
     let mut scene = Scene::default();
     if transforms.camera.contains_key("ply_file_path") {
         let what = "its points say not which view sees them and are not read";
-        scene.warnings.push(format!("{}: {what}", file.display()));
+        let advice = "give --depth-range NEAR,FAR, or read the COLMAP model that the file was made from";
+        scene.warnings.push(Warning::new(format!("{}: {what}", file.display()), advice));
     }
     admit(candidates, file, &images, options, &mut scene)?;
     Ok(scene)

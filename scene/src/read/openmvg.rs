@@ -11,7 +11,7 @@ use super::json::{json_at, number, numbers};
 use super::points::PointsInto;
 use super::views::{Candidate, Geometry, admit};
 use super::{ReadError, ReadOptions, ViewError, inconsistent, relative_name};
-use crate::{Distortion, Intrinsics, Pose, Scene, ViewId};
+use crate::{Distortion, Intrinsics, Pose, Scene, ViewId, Warning};
 
 /// The id that stands for "none".
 const UNDEFINED: u32 = u32::MAX;
@@ -108,7 +108,10 @@ pub(super) fn read(file: &Path, options: &ReadOptions) -> Result<Scene, ReadErro
         candidates.push(Candidate { id: ViewId(id), name, geometry });
     }
     if unposed > 0 {
-        scene.warnings.push(format!("{unposed} views of {} have no pose or no camera", file.display()));
+        scene.warnings.push(Warning::new(
+            format!("{unposed} views of {} have no pose or no camera", file.display()),
+            "localise them with openMVG_main_SfM_Localization, or add photographs between them and the others",
+        ));
     }
     admit(candidates, file, &images, options, &mut scene)?;
 

@@ -8,10 +8,12 @@ use super::bytes::Bytes;
 use super::points::PointsInto;
 use super::views::{Candidate, Geometry, admit};
 use super::{ReadError, ReadOptions, ViewError, relative_name};
-use crate::{Distortion, Intrinsics, Pose, Scene, ViewId};
+use crate::{Distortion, Intrinsics, Pose, Scene, ViewId, Warning};
 
 /// The newest version of the file whose layout is known.
-const NEWEST: u32 = 3;
+const NEWEST: u32 = 7;
+/// Bytes of what version 7 keeps of the overlap with another image.
+const VIEW_SCORE: u64 = 24;
 /// The index that stands for "none".
 const NONE: u32 = u32::MAX;
 
@@ -49,9 +51,17 @@ pub(super) fn read(file: &Path, options: &ReadOptions) -> Result<Scene, ReadErro
     for id in 0..images as u32 {
         let at = bytes.at();
         let name = relative_name(&bytes.text_of_length()?);
+        if version > 4 {
+            bytes.text_of_length()?; // its mask
+        }
         let [platform, camera, pose] = [bytes.u32()?, bytes.u32()?, bytes.u32()?];
         if version > 2 {
             bytes.u32()?; // the id that the program gave it, which its own tracks do not use
+        }
+        if version > 6 {
+            bytes.skip(3 * 4)?; // least, mean and largest depth of its points, which may all be 0
+            let scores = bytes.count(VIEW_SCORE, "scores of other images")?;
+            bytes.skip(scores as u64 * VIEW_SCORE)?;
         }
         let Some(platform) = platforms.get(platform as usize) else {
             let what = format!("image {name:?} is of platform {platform}, which does not exist");
@@ -70,13 +80,16 @@ pub(super) fn read(file: &Path, options: &ReadOptions) -> Result<Scene, ReadErro
     }
     let mut scene = Scene::default();
     if unposed > 0 {
-        scene.warnings.push(format!("{unposed} images of {} have no pose", file.display()));
+        scene.warnings.push(Warning::new(
+            format!("{unposed} images of {} have no pose", file.display()),
+            "add photographs between them and the others where the scene was solved, if they are needed",
+        ));
     }
     let folder = file.parent().unwrap_or(Path::new("."));
     let root = options.images.clone().unwrap_or_else(|| PathBuf::from(folder));
     admit(candidates, file, &root, options, &mut scene)?;
     points(&mut bytes, images as u32, &mut scene)?;
-    // Normals, colours and lines follow, which are not needed.
+    // Normals, colours, lines and a box follow, which are not needed.
     Ok(scene)
 }
 
@@ -87,6 +100,9 @@ fn platforms(bytes: &mut Bytes, version: u32) -> Result<Vec<Platform>, ReadError
         let mut platform = Platform { cameras: Vec::new(), poses: Vec::new() };
         for _ in 0..bytes.count(8 + 21 * 8, "cameras")? {
             bytes.text_of_length()?;
+            if version > 3 {
+                bytes.text_of_length()?; // which band of light it takes
+            }
             let (width, height) = if version > 0 { (bytes.u32()?, bytes.u32()?) } else { (0, 0) };
             let (matrix, rotation, centre) = (bytes.f64s()?, bytes.f64s()?, bytes.f64s()?);
             platform.cameras.push(Camera { width, height, matrix, rotation, centre });

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::str::SplitAsciiWhitespace;
 
 use super::ReadError;
-use crate::{SourceScore, ViewId};
+use crate::{SourceScore, ViewId, Warning};
 
 /// What was repaired, counted over the file, for there may be a thousand of each.
 #[derive(Default)]
@@ -25,7 +25,7 @@ pub(super) fn parse_pairs(
     path: &Path,
     text: &str,
     is_known: impl Fn(ViewId) -> bool,
-    warnings: &mut Vec<String>,
+    warnings: &mut Vec<Warning>,
 ) -> Result<BTreeMap<ViewId, Vec<SourceScore>>, ReadError> {
     let error = |line: usize, what: String| ReadError::Text { path: path.to_owned(), line, what };
     let lines = text.lines().enumerate().map(|(k, line)| (k + 1, line.split_ascii_whitespace()));
@@ -59,20 +59,32 @@ pub(super) fn parse_pairs(
         }
     }
     if given < count {
-        warnings.push(format!(
-            "{}: {count} reference views are announced, the file ends after {given}",
-            path.display()
+        warnings.push(Warning::new(
+            format!(
+                "{}: {count} reference views are announced, the file ends after {given}",
+                path.display()
+            ),
+            "look for a complete copy; views that are missing there get sources by overlap",
         ));
     }
-    for (entries, what) in [
-        (repairs.unknown, "name a view that the scene does not have; they were left out"),
-        (repairs.own, "name their own reference view; they were left out"),
-        (repairs.repeated, "name a source a second time; they were left out"),
-        (repairs.unsorted, "stand behind one of a lower score; they were sorted"),
-        (repairs.miscounted, "list another number of sources than they announce; those listed were taken"),
+    let harmless = "nothing: what is meant is clear";
+    for (entries, what, advice) in [
+        (
+            repairs.unknown,
+            "name a view that the scene does not have; they were left out",
+            "see whether images or camera files were lost",
+        ),
+        (repairs.own, "name their own reference view; they were left out", harmless),
+        (repairs.repeated, "name a source a second time; they were left out", harmless),
+        (repairs.unsorted, "stand behind one of a lower score; they were sorted", harmless),
+        (
+            repairs.miscounted,
+            "list another number of sources than they announce; those listed were taken",
+            "see whether the file was cut or edited",
+        ),
     ] {
         if entries > 0 {
-            warnings.push(format!("{}: {entries} entries {what}", path.display()));
+            warnings.push(Warning::new(format!("{}: {entries} entries {what}", path.display()), advice));
         }
     }
     Ok(pairs)
@@ -126,7 +138,7 @@ mod tests {
     type Pairs = BTreeMap<ViewId, Vec<SourceScore>>;
 
     /// Views 0 to 4 exist.
-    fn parsed(text: &str) -> (Result<Pairs, String>, Vec<String>) {
+    fn parsed(text: &str) -> (Result<Pairs, String>, Vec<Warning>) {
         let mut warnings = Vec::new();
         let pairs = parse_pairs(Path::new("pair.txt"), text, |id| id.0 < 5, &mut warnings);
         (pairs.map_err(|error| error.to_string()), warnings)
@@ -160,7 +172,7 @@ mod tests {
             "1 entries list another number",
         ];
         for (warning, part) in warnings.iter().zip(expected) {
-            assert!(warning.contains(part), "{warning}");
+            assert!(warning.what.contains(part), "{warning}");
         }
         assert_eq!(warnings.len(), 5);
     }
@@ -170,7 +182,7 @@ mod tests {
         for text in ["4294967295\n0\n1 1 5\n", "2\n0\n1 1 5\n3\n"] {
             let (pairs, warnings) = parsed(text);
             assert_eq!(ids(&pairs.expect("clear enough"), 0), [1]);
-            assert!(warnings.len() == 1 && warnings[0].ends_with("the file ends after 1"), "{warnings:?}");
+            assert!(warnings.len() == 1 && warnings[0].what.ends_with("the file ends after 1"), "{warnings:?}");
         }
     }
 

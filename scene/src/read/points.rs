@@ -1,6 +1,6 @@
 //! Sparse points on their way into a scene.
 
-use crate::{Scene, ViewId};
+use crate::{Scene, ViewId, Warning};
 
 /// Takes points in: those that are not finite are counted and left out, views that the scene does
 /// not have vanish from tracks.
@@ -28,7 +28,8 @@ impl<'a> PointsInto<'a> {
     pub fn finish(self) {
         if self.not_finite > 0 {
             let what = "sparse points are not finite and were left out";
-            self.scene.warnings.push(format!("{} {what}", self.not_finite));
+            let advice = "solve the scene again if they are many: it did not converge there";
+            self.scene.warnings.push(Warning::new(format!("{} {what}", self.not_finite), advice));
         }
     }
 }

@@ -7,9 +7,7 @@ use rayon::prelude::*;
 
 use super::names::{ResolveError, resolve_inside};
 use super::{ReadError, ReadOptions, ViewError, inconsistent};
-use crate::{
-    Camera, DepthRange, Distortion, Intrinsics, Pose, Scene, View, ViewId, fit_to_image, image_size,
-};
+use crate::{Camera, DepthRange, Distortion, Intrinsics, Pose, Scene, View, ViewId, fit_to_image, image_size, Warning};
 
 /// A view as a format's files describe it, before its image was looked at.
 pub(super) struct Candidate {
@@ -40,7 +38,7 @@ impl<E: Into<ViewError>> From<E> for Refusal {
     }
 }
 
-/// Adds the candidates that hold to the scene, with warnings for the others. Names of candidates
+/// Adds the candidates that hold to the scene, and the others to those that were skipped. Names of candidates
 /// are relative to `images`; two with the same name are refused as a contradiction of `file`.
 pub(super) fn admit(
     candidates: Vec<Candidate>,
@@ -73,11 +71,10 @@ pub(super) fn admit(
 }
 
 fn skip(scene: &mut Scene, name: String, reason: String) {
-    scene.warnings.push(format!("view {name:?} is left out: {reason}"));
     scene.skipped.insert(name, reason);
 }
 
-fn examine(candidate: Candidate, images: &Path) -> Result<(View, Option<String>), Refusal> {
+fn examine(candidate: Candidate, images: &Path) -> Result<(View, Option<Warning>), Refusal> {
     let Candidate { id, name, geometry } = candidate;
     let geometry = geometry?;
     let image = locate(images, &name)?;
@@ -86,10 +83,11 @@ fn examine(candidate: Candidate, images: &Path) -> Result<(View, Option<String>)
     let (intrinsics, warning) = if geometry.has_size {
         let (intrinsics, scaled) = fit_to_image(&stated.checked()?, width, height)?;
         let warning = scaled.then(|| {
-            format!(
+            let what = format!(
                 "view {name:?}: its image is {width}x{height}, its camera {}x{}; the intrinsics were scaled",
                 stated.width, stated.height
-            )
+            );
+            Warning::new(what, "nothing, if the image was made smaller or larger as a whole and not cropped")
         });
         (intrinsics, warning)
     } else {
