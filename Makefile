@@ -3,7 +3,7 @@
 CARGO ?= cargo
 PROGRAM := target/release/planesweep
 
-.PHONY: help libtorch build release test check demo clean
+.PHONY: help libtorch build release test slow check demo clean
 
 help: ## list the targets
 	@awk -F':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
@@ -19,6 +19,9 @@ release: libtorch ## build target/release/planesweep
 
 test: libtorch ## run all tests; what was skipped is counted and named
 	@scripts/test.sh
+
+slow: libtorch ## run the tests that take too long for every run; scripts/slow.sh names them
+	@scripts/slow.sh
 
 check: libtorch ## formatting, lints, documentation, licences
 	$(CARGO) fmt --all --check
