@@ -61,7 +61,7 @@ fn main() -> ExitCode {
                 let _ = writeln!(stdout(), "{}", serde_json::json!({ "error": format!("{error:#}") }));
             }
             eprintln!("planesweep: {error:#}");
-            ExitCode::FAILURE
+            commands::worker::exit_code(&error).map_or(ExitCode::FAILURE, ExitCode::from)
         }
     }
 }

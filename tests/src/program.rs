@@ -125,7 +125,7 @@ pub fn run<S: AsRef<OsStr>>(arguments: impl IntoIterator<Item = S>) -> Finished 
 /// The program that PLANESWEEP_PROGRAM names, or else the one beside the running test, of the same
 /// profile. Cargo builds that where it is missing or older than its sources; several tests that ask at
 /// once wait for one another.
-fn program() -> &'static PathBuf {
+pub fn program() -> &'static PathBuf {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
     PROGRAM.get_or_init(|| {
         if let Some(named) = std::env::var_os("PLANESWEEP_PROGRAM") {

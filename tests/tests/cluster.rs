@@ -12,6 +12,9 @@ const DEADLINE: Duration = Duration::from_mins(5);
 /// Eight views, each slow enough for a fault to meet it.
 const SLOW: [&str; 2] = ["--depths", "128"];
 const TORCH: [&str; 2] = ["--device", "torch"];
+/// Exit codes of a worker.
+const REFUSED: i32 = 78;
+const TERMINATED: i32 = 75;
 
 fn of_courtyard() -> Bench {
     Bench::new(|folder| courtyard(folder, 8, 320, 256))
@@ -64,7 +67,7 @@ fn a_cluster_gives_the_cloud_of_one_process_and_is_told_to_go() {
     let unknown = run(["cancel", "no-such-run", "--coordinator", &url]).expect_code(1);
     assert!(unknown.stderr.contains("no-such-run"), "{}", unknown.stderr);
 
-    let workers = [cluster.worker(&[]), cluster.worker(&[])];
+    let (staying, leaving) = (cluster.worker(&[]), cluster.worker(&[]));
     let together = bench.submit("together", &cluster, &[]).wait().expect_code(0).json();
     assert!(together["points"].as_u64() > Some(500), "{}", together["points"]);
     assert_eq!(alone["cloud_blake3"], together["cloud_blake3"]);
@@ -81,12 +84,13 @@ fn a_cluster_gives_the_cloud_of_one_process_and_is_told_to_go() {
     let again = bench.submit("again", &cluster, &[]).wait().expect_code(0);
     assert!(again.stderr.contains("13 of 13 jobs are done already"), "{}", again.stderr);
 
+    assert!(send("TERM", leaving.pid()));
+    let left = leaving.wait().expect_code(TERMINATED);
+    assert!(left.stderr.contains("another worker may take its place"), "{}", left.stderr);
     assert!(cluster.coordinator().is_running());
     let ended = cluster.drain().wait().expect_code(0);
     assert!(ended.stderr.contains("stopping when the running jobs are done"), "{}", ended.stderr);
-    for worker in workers {
-        let _ = worker.wait().expect_code(0);
-    }
+    let _ = staying.wait().expect_code(0);
 }
 
 #[test]
@@ -169,7 +173,7 @@ fn who_has_no_token_is_refused_and_other_hosts_are_not_let_in_without_one() {
     for more in [&[][..], &["--token-file", &wrong]] {
         let refused = bench.submit("out", &cluster, more).wait().expect_code(1);
         assert!(refused.stderr.contains("unauthenticated"), "{}", refused.stderr);
-        let refused = cluster.worker(more).wait().expect_code(1);
+        let refused = cluster.worker(more).wait().expect_code(REFUSED);
         assert!(refused.stderr.contains("unauthenticated"), "{}", refused.stderr);
     }
     let _ = bench.submit("out", &cluster, &["--token-file", &token]).wait().expect_code(0);

@@ -13,7 +13,7 @@ const TOKEN_VARIABLE: &str = "PLANESWEEP_TOKEN";
 #[derive(Clone, Debug, Args)]
 pub struct TokenArgs {
     /// The file that holds the token; by default the variable PLANESWEEP_TOKEN does, if there is one.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, env = "PLANESWEEP_TOKEN_FILE", value_name = "FILE")]
     pub token_file: Option<PathBuf>,
 }
 

@@ -1,12 +1,13 @@
 //! `planesweep worker`.
 
+use std::fmt;
 use std::io::Read;
 
 use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
 use planesweep_plan::WorkerId;
 use planesweep_proto::{Role, Slots};
-use planesweep_worker::{WorkerConfig, run_worker};
+use planesweep_worker::{WorkerConfig, WorkerError, run_worker};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
@@ -17,7 +18,9 @@ use crate::network::{Placement, backend_factory, processors};
 
 /// Arguments of `worker`.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: planesweep worker --coordinator http://10.0.0.1:7070 --role both")]
+#[command(after_help = "Exit codes: 0 the coordinator said stop; 75 a SIGTERM did, start it again elsewhere; 78 the \
+    coordinator refuses it (token, version), do not start it again; 1 anything else.\n\
+    Example: planesweep worker --coordinator http://10.0.0.1:7070 --role both")]
 pub struct WorkerArgs {
     #[command(flatten)]
     pub connect: ConnectArgs,
@@ -54,6 +57,26 @@ const SLOTS: Slots = Slots { infer: 2, fuse: 2 };
 /// Budget of images, and of depth maps.
 const CACHE_BYTES: u64 = 256 << 20;
 
+/// The worker was told to go by a signal, not by the coordinator: its work is not done.
+#[derive(Debug)]
+struct Terminated;
+
+impl fmt::Display for Terminated {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("stopped by SIGTERM; another worker may take its place")
+    }
+}
+
+/// The exit codes that tell whoever places workers what to do next; they are those of sysexits.h.
+pub fn exit_code(error: &anyhow::Error) -> Option<u8> {
+    const TEMPFAIL: u8 = 75;
+    const CONFIG: u8 = 78;
+    match error.downcast_ref() {
+        Some(WorkerError::Refused { .. }) => Some(CONFIG),
+        _ => error.is::<Terminated>().then_some(TEMPFAIL),
+    }
+}
+
 /// Works until told to stop.
 pub fn run(args: WorkerArgs) -> Result<Outcome> {
     let role = match args.role {
@@ -87,9 +110,10 @@ pub fn run(args: WorkerArgs) -> Result<Outcome> {
         .enable_all()
         .build()
         .context("cannot start the runtime")?;
+    let terminated = CancellationToken::new();
     runtime.block_on(async {
-        let stop = CancellationToken::new();
-        stop_on_signal(stop.clone())?;
+        let stop = terminated.child_token();
+        stop_on_signal(terminated.clone())?;
         if args.stop_with_stdin {
             let stop = stop.clone();
             std::thread::spawn(move || {
@@ -103,6 +127,9 @@ pub fn run(args: WorkerArgs) -> Result<Outcome> {
     })?;
     // A forward pass cannot be interrupted, so its thread may still run: leave without it.
     runtime.shutdown_background();
+    if terminated.is_cancelled() {
+        return Err(anyhow::Error::msg(Terminated));
+    }
     Ok(Outcome { text: String::new(), value: json!({ "worker": id }), skipped_views: false })
 }
 

@@ -1,0 +1,72 @@
+"""Checks the Kubernetes manifests against the published schemas, strictly, and prints one line per manifest.
+
+    python scripts/deploy_check.py deploy/kubernetes/base deploy/kubernetes/gpu
+
+Each folder is a kustomization; resources of folders that it builds on are read, too, and its patches are merged into
+them as Kubernetes merges: lists of named things by name, other lists as a whole. What does not fit is named on
+stderr, with exit status 1. Needs kubernetes-validate, which brings the schemas along, and PyYAML.
+"""
+
+import pathlib
+import sys
+
+import kubernetes_validate
+import yaml
+
+# The oldest in which what we use is stable, and the newest that is published.
+VERSIONS = ["1.34", "1.37"]
+
+
+def documents(path):
+    return [document for document in yaml.safe_load_all(path.read_text()) if document]
+
+
+def merged(old, new):
+    if isinstance(old, dict) and isinstance(new, dict):
+        return old | {key: merged(old[key], value) if key in old else value for key, value in new.items()}
+    named = lambda items: all(isinstance(item, dict) and "name" in item for item in items)
+    if isinstance(old, list) and isinstance(new, list) and named(old) and named(new):
+        by_name = {item["name"]: item for item in old}
+        for item in new:
+            by_name[item["name"]] = merged(by_name.get(item["name"], {}), item)
+        return list(by_name.values())
+    return new
+
+
+def name(document):
+    return document["kind"], document["metadata"]["name"]
+
+
+def build(folder):
+    """The documents of a kustomization by kind and name."""
+    (kustomization,) = documents(folder / "kustomization.yaml")
+    built = {}
+    for resource in kustomization["resources"]:
+        path = folder / resource
+        more = build(path) if path.is_dir() else {name(document): document for document in documents(path)}
+        if both := built.keys() & more.keys():
+            raise ValueError(f"{folder}: more than one {both}")
+        built |= more
+    for patch in kustomization.get("patches", []):
+        for document in documents(folder / patch["path"]):
+            built[name(document)] = merged(built[name(document)], document)
+    return built
+
+
+def main():
+    failed = False
+    for folder in map(pathlib.Path, sys.argv[1:]):
+        for (kind, of), document in build(folder).items():
+            for version in VERSIONS:
+                try:
+                    kubernetes_validate.validate(document, version, strict=True)
+                    print(f"{folder.name}: {kind} {of} is valid in {version}")
+                except kubernetes_validate.ValidationError as error:
+                    failed = True
+                    where = ".".join(map(str, error.path))
+                    print(f"{folder.name}: {kind} {of}, {where}: {error.message}", file=sys.stderr)
+    sys.exit(failed)
+
+
+if __name__ == "__main__":
+    main()

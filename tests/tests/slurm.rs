@@ -1,0 +1,86 @@
+//! The jobs of `deploy/slurm` on a real Slurm of one node: the cloud is that of one process, although the workers are
+//! preempted and the coordinator reaches its time limit.
+
+use std::ffi::OsStr;
+use std::fs;
+use std::path::Path;
+use std::time::Duration;
+
+use planesweep_tests::{Bench, Running, Slurm, courtyard, free_port, program, wait_until};
+
+/// How long a state may take to come; far above what it ever takes.
+const DEADLINE: Duration = Duration::from_mins(5);
+/// Each view is slow enough for a fault to meet it.
+const SLOW: [&str; 4] = ["--depths", "128", "--device", "torch"];
+
+fn sbatch(name: &str) -> String {
+    format!("{}/../deploy/slurm/{name}.sbatch", env!("CARGO_MANIFEST_DIR"))
+}
+
+#[track_caller]
+fn wait_for(what: &str, folder: &Path, is_there: impl FnMut() -> bool) {
+    let came = wait_until(DEADLINE, is_there);
+    let logs = || {
+        let files = fs::read_dir(folder).into_iter().flatten().flatten();
+        let logs = files.filter(|file| file.file_name().to_string_lossy().ends_with(".log"));
+        logs.filter_map(|file| fs::read_to_string(file.path()).ok()).collect::<String>()
+    };
+    assert!(came, "{what} does not come:\n{}", logs());
+}
+
+#[test]
+fn jobs_of_slurm_survive_preemption_and_time_limit() {
+    let Some(slurm) = Slurm::new("jobs_of_slurm_survive_preemption_and_time_limit") else { return };
+    let bench = Bench::new(|folder| courtyard(folder, 8, 320, 256));
+    let _ = bench.reconstruct("calm", &[&SLOW[..], &["--workers", "2"]].concat()).expect_code(0);
+
+    let shared = bench.path("shared");
+    fs::create_dir(&shared).expect("made");
+    let folder = Path::new(&shared);
+    let port = free_port().to_string();
+    let binaries = program().parent().expect("a program lies in a folder");
+    let path = [binaries.as_os_str(), std::env::var_os("PATH").unwrap_or_default().as_os_str()].join(OsStr::new(":"));
+    let variables: [(&str, &OsStr); 4] = [
+        ("PLANESWEEP_SHARED", shared.as_ref()),
+        ("PLANESWEEP_HOST", "127.0.0.1".as_ref()),
+        ("PLANESWEEP_PORT", port.as_ref()),
+        ("PATH", &path),
+    ];
+    let coordinator = slurm.batch(folder, &["--partition=service", &sbatch("coordinator")], &variables);
+    let worker = sbatch("worker");
+    let workers = ["--array=0-1", "--cpus-per-task=1", &worker, "--device", "torch"];
+    let workers = slurm.batch(folder, &workers, &variables);
+    wait_for("the coordinator's address", folder, || folder.join("address").exists());
+    let url = format!("http://127.0.0.1:{port}");
+    let token = format!("{shared}/token");
+    let struck = bench.submit("struck", &url, &[&SLOW[..], &["--token-file", &token]].concat());
+    let results = |run: &Running| {
+        let done = |line: &str| line.split_once("/25 jobs").and_then(|(done, _)| done.parse::<u32>().ok());
+        run.stderr().lines().filter_map(done).max().unwrap_or(0)
+    };
+    wait_for("a result", folder, || results(&struck) >= 1);
+
+    // An urgent job takes all processors but the coordinator's.
+    let urgent = slurm.batch(folder, &["--partition=urgent", "--ntasks=3", "--wrap=sleep 1"], &[]);
+    let is_preempted = || {
+        ["0", "1"].iter().all(|task| slurm.field(&format!("{workers}_{task}"), "Restarts") == "1")
+    };
+    wait_for("the preemption", folder, is_preempted);
+    wait_for("the urgent job's end", folder, || slurm.field(&urgent, "JobState") == "COMPLETED");
+
+    // What comes a minute before the time limit.
+    slurm.ask("scancel", &["--batch", "--signal=TERM", &coordinator]);
+    wait_for("the requeue", folder, || slurm.field(&coordinator, "Restarts") == "1");
+    let struck = struck.wait().expect_code(0);
+    assert!(struck.stderr.contains("the coordinator is back"), "{}", struck.stderr);
+    let cloud = bench.read("struck/cloud.ply");
+    assert!(cloud.len() > 10_000 && cloud == bench.read("calm/cloud.ply"), "the clouds differ");
+
+    // The end: the coordinator takes its workers along.
+    slurm.ask("scancel", &["--batch", "--signal=INT", &coordinator]);
+    wait_for("the end", folder, || slurm.ask("squeue", &["-h"]).is_empty());
+    for job in [&coordinator, &format!("{workers}_0"), &format!("{workers}_1")] {
+        assert_eq!(slurm.field(job, "JobState"), "COMPLETED");
+        assert_eq!(slurm.field(job, "ExitCode"), "0:0");
+    }
+}
