@@ -18,9 +18,11 @@ use crate::network::{Placement, backend_factory, processors};
 
 /// Arguments of `worker`.
 #[derive(Debug, Args)]
-#[command(after_help = "Exit codes: 0 the coordinator said stop; 75 a SIGTERM did, start it again elsewhere; 78 the \
+#[command(
+    after_help = "Exit codes: 0 the coordinator said stop; 75 a SIGTERM did, start it again elsewhere; 78 the \
     coordinator refuses it (token, version), do not start it again; 1 anything else.\n\
-    Example: planesweep worker --coordinator http://10.0.0.1:7070 --role both")]
+    Example: planesweep worker --coordinator http://10.0.0.1:7070 --role both"
+)]
 pub struct WorkerArgs {
     #[command(flatten)]
     pub connect: ConnectArgs,

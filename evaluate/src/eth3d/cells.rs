@@ -26,7 +26,8 @@ pub fn cell_means(
         for members in by_cell.chunk_by(|a, b| a.0 == b.0) {
             for (tolerance, (sum, cells)) in sums.iter_mut().enumerate() {
                 let held = members.iter().filter_map(|(_, index)| holds(*index, tolerance));
-                let (count, good) = held.fold((0_usize, 0_usize), |(n, good), held| (n + 1, good + usize::from(held)));
+                let (count, good) =
+                    held.fold((0_usize, 0_usize), |(n, good), held| (n + 1, good + usize::from(held)));
                 if count > 0 {
                     *sum += good as f64 / count as f64;
                     *cells += 1;

@@ -40,7 +40,9 @@ pub enum Eth3dError {
         what: &'static str,
     },
     /// A scan's matrix is not one of a rigid motion.
-    #[error("the matrix of scan {place} of the MeshLab project is not 16 numbers of a rotation and a translation")]
+    #[error(
+        "the matrix of scan {place} of the MeshLab project is not 16 numbers of a rotation and a translation"
+    )]
     Matrix {
         /// Counted from 1.
         place: usize,
@@ -205,7 +207,8 @@ mod tests {
             to_world: Matrix4::new_translation(&nalgebra::Vector3::new(1.0, 2.0, 0.0)),
         };
         let cloud = [Point3::new(5.0, 2.0, 0.0)];
-        let accuracy = |scans: &[LaserScan]| compare(&cloud, scans, &Eth3dOptions::default()).scores[0].accuracy;
+        let accuracy =
+            |scans: &[LaserScan]| compare(&cloud, scans, &Eth3dOptions::default()).scores[0].accuracy;
         assert_eq!((accuracy(&[wall()]), accuracy(&[wall(), near])), (0.0, 1.0));
     }
 

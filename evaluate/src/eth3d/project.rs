@@ -32,13 +32,15 @@ fn placed_scan(mesh: Node, place: usize) -> Result<PlacedScan, Eth3dError> {
     let file = mesh.attribute("filename").filter(|file| !file.is_empty());
     let file = file.ok_or(Eth3dError::Incomplete { place, what: "filename" })?;
     let matrix = mesh.children().find(|node| node.has_tag_name("MLMatrix44"));
-    let matrix = matrix.and_then(|node| node.text()).ok_or(Eth3dError::Incomplete { place, what: "MLMatrix44" })?;
+    let matrix =
+        matrix.and_then(|node| node.text()).ok_or(Eth3dError::Incomplete { place, what: "MLMatrix44" })?;
     let numbers: Option<Vec<f64>> = matrix.split_whitespace().map(|word| word.parse().ok()).collect();
     let numbers = numbers.filter(|numbers| numbers.len() == 16).ok_or(Eth3dError::Matrix { place })?;
     let to_world = Matrix4::from_row_slice(&numbers);
     let rotation = to_world.fixed_view::<3, 3>(0, 0).into_owned();
     let off = (rotation * rotation.transpose() - nalgebra::Matrix3::identity()).amax();
-    let is_rigid = off < ROTATION_TOLERANCE && rotation.determinant() > 0.0 && numbers[12..] == [0.0, 0.0, 0.0, 1.0];
+    let is_rigid =
+        off < ROTATION_TOLERANCE && rotation.determinant() > 0.0 && numbers[12..] == [0.0, 0.0, 0.0, 1.0];
     let is_finite = numbers.iter().all(|v| v.is_finite());
     if is_rigid && is_finite {
         Ok(PlacedScan { file: file.to_owned(), to_world })
@@ -72,7 +74,9 @@ mod tests {
             parse_project(&PROJECT.replacen(from, to, 1)).expect_err("refused").to_string()
         };
         assert_eq!(refused(" filename=\"scan1.ply\"", ""), "scan 1 of the MeshLab project has no filename");
-        for (from, to) in [("0 -1 0 2.5", "0 -2 0 2.5"), ("-3", "nan"), ("-3", ""), ("0 0 0 1 \n", "0 0 1 1 \n")] {
+        for (from, to) in
+            [("0 -1 0 2.5", "0 -2 0 2.5"), ("-3", "nan"), ("-3", ""), ("0 0 0 1 \n", "0 0 1 1 \n")]
+        {
             assert!(refused(from, to).starts_with("the matrix of scan 1 of"), "{to}");
         }
         assert!(refused("</MeshGroup>", "").starts_with("cannot understand"));
