@@ -10,8 +10,8 @@ const BARS: usize = 65;
 /// The range takes the middle of the drawing; this share of its extent lies on either side of it.
 const BESIDE: f64 = 0.25;
 
-/// Draws a histogram of `depths` (z, scene units) as SVG, for a page to hold, over the range from `near` to `far`, which is
-/// shaded, and what lies close beside it; points beyond the drawing are counted in words.
+/// Draws a histogram of `depths` (z, scene units) as SVG with a caption, for a page to hold, over the range from `near` to
+/// `far`, which is shaded, and what lies close beside it; points beyond the drawing are counted in words.
 pub fn plot_depth_histogram(depths: &[f64], near: f64, far: f64) -> String {
     let extent = (far - near).max(1e-9 * far.abs()).max(f64::MIN_POSITIVE);
     let (start, end) = (near - BESIDE * extent, far + BESIDE * extent);
@@ -38,20 +38,19 @@ pub fn plot_depth_histogram(depths: &[f64], near: f64, far: f64) -> String {
     });
     let beyond = match (nearer, farther) {
         (0, 0) => String::new(),
-        (nearer, farther) => format!("{nearer} points are nearer, {farther} farther than drawn"),
+        (nearer, farther) => format!("; {nearer} of them are nearer, {farther} farther than drawn"),
     };
     let (left, right, below, total) = (x(near), x(far), HEIGHT + 14.0, HEIGHT + 18.0);
     format!(
-        "<svg viewBox=\"0 0 {WIDTH} {total}\" width=\"{WIDTH}\" \
-         font-family=\"sans-serif\" font-size=\"11\" fill=\"currentColor\">\
+        "<svg viewBox=\"0 0 {WIDTH} {total}\" role=\"img\">\
          <title>sparse points by depth, and the depth range</title>\
-         <rect x=\"{left:.1}\" width=\"{range:.1}\" height=\"{HEIGHT}\" fill=\"#2d6cdf\" opacity=\"0.15\"/>\
-         <path d=\"{bars}\" fill=\"#2d6cdf\"/><path d=\"M0 {HEIGHT}H{WIDTH}\" stroke=\"#999\"/>\
+         <rect class=\"track\" x=\"{left:.1}\" width=\"{range:.1}\" height=\"{HEIGHT}\"/>\
+         <path class=\"bar\" d=\"{bars}\"/><path d=\"M0 {HEIGHT}H{WIDTH}\" stroke=\"#999\"/>\
          <text x=\"{left:.1}\" y=\"{below}\">{near:.4}</text>\
          <text x=\"{right:.1}\" y=\"{below}\" text-anchor=\"end\">{far:.4}</text>\
-         <text x=\"{middle:.1}\" y=\"11\" text-anchor=\"middle\">{beyond}</text></svg>\n",
+         </svg>\n<p class=\"soft\">{points} sparse points by depth; the depth range is shaded{beyond}</p>\n",
         range = right - left,
-        middle = 0.5 * WIDTH,
+        points = depths.len(),
     )
 }
 
@@ -65,13 +64,13 @@ mod tests {
         // Two bars: the one of two points has the full height.
         assert_eq!(svg.matches('M').count(), 3, "{svg}");
         assert!(svg.contains("v-68.0") && svg.contains("v-34.0"), "{svg}");
-        assert!(svg.contains("2 points are nearer, 1 farther"), "{svg}");
+        assert!(svg.contains("6 sparse points") && svg.contains("2 of them are nearer, 1 farther"), "{svg}");
         assert!(svg.contains("4.0000") && svg.contains("10.0000"));
     }
 
     #[test]
     fn no_points_and_no_extent_make_an_empty_plot() {
         let svg = plot_depth_histogram(&[], 2.0, 2.0);
-        assert!(!svg.contains("NaN") && !svg.contains("inf") && !svg.contains("points are"), "{svg}");
+        assert!(!svg.contains("NaN") && !svg.contains("inf") && !svg.contains("of them"), "{svg}");
     }
 }

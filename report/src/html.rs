@@ -157,18 +157,18 @@ fn funnel_bars(funnel: &Funnel) -> String {
 fn bars<'a>(rows: impl Iterator<Item = (&'a str, f64, String)>) -> String {
     const ROW: usize = 22;
     let rows: Vec<_> = rows.collect();
-    let mut svg = format!("<svg viewBox=\"0 0 520 {}\" role=\"img\">", (rows.len() * ROW).max(1));
+    let mut svg = format!("<svg viewBox=\"0 0 460 {}\" role=\"img\">", (rows.len() * ROW).max(1));
     for (index, (name, share, figure)) in rows.into_iter().enumerate() {
         let (top, base) = (index * ROW + 5, index * ROW + 15);
         push(
             &mut svg,
             format_args!(
                 "<text class=\"name\" x=\"0\" y=\"{base}\">{name}</text>\
-                 <rect class=\"track\" x=\"100\" y=\"{top}\" width=\"270\" height=\"12\" rx=\"3\"/>\
-                 <rect class=\"bar\" x=\"100\" y=\"{top}\" width=\"{width:.1}\" height=\"12\" rx=\"3\"/>\
-                 <text x=\"382\" y=\"{base}\">{figure}</text>",
+                 <rect class=\"track\" x=\"124\" y=\"{top}\" width=\"190\" height=\"12\" rx=\"3\"/>\
+                 <rect class=\"bar\" x=\"124\" y=\"{top}\" width=\"{width:.1}\" height=\"12\" rx=\"3\"/>\
+                 <text x=\"326\" y=\"{base}\">{figure}</text>",
                 name = escape(name),
-                width = 270.0 * share,
+                width = 190.0 * share,
                 figure = escape(&figure),
             ),
         );
