@@ -70,12 +70,7 @@ impl Slurm {
 
     /// Submits a batch script from a folder, where its output lies then; the job's id.
     #[track_caller]
-    pub fn batch(
-        &self,
-        folder: &Path,
-        arguments: &[&str],
-        variables: &[(&str, &OsStr)],
-    ) -> String {
+    pub fn batch(&self, folder: &Path, arguments: &[&str], variables: &[(&str, &OsStr)]) -> String {
         let mut command = self.command("sbatch");
         command.arg("--parsable").arg("--chdir").arg(folder).args(arguments).envs(variables.iter().copied());
         let output = command.output().expect("sbatch is there");
@@ -90,6 +85,13 @@ impl Slurm {
         let mut fields = shown.split_ascii_whitespace().filter_map(|field| field.split_once('='));
         let found = fields.find_map(|(key, value)| (key == name).then(|| value.to_owned()));
         found.unwrap_or_else(|| panic!("no {name} in {shown}"))
+    }
+
+    /// What its queue and its controller's log say, for a test that fails.
+    pub fn describe(&self) -> String {
+        let queue = self.try_ask("squeue", &[]).unwrap_or_default();
+        let log = fs::read_to_string(self.folder.path().join("slurmctld.log")).unwrap_or_default();
+        format!("{queue}\n{log}")
     }
 }
 

@@ -27,6 +27,8 @@ struct Scenario<'a> {
 impl Scenario<'_> {
     /// What `planesweep status` says within the coordinator's container; `None` while it cannot.
     fn status(&self) -> Option<Value> {
+        // Each question is a process.
+        std::thread::sleep(Duration::from_millis(200));
         let ask = ["exec", self.coordinator, "planesweep", "status", RUN, "--json"];
         let (answered, said) = self.containers.try_docker(&ask);
         serde_json::from_str(&said).ok().filter(|_| answered)
@@ -117,7 +119,10 @@ fn containers_on_two_networks_survive_kill_partition_and_restart() {
     let both = scenario.wait_for("work for both", |s| is_busy(s, "killed") && is_busy(s, "cut"));
     containers.docker(&["kill", &killed]);
     containers.docker(&["network", "disconnect", &south, &cut]);
-    assert!(both["state"] == "running" && both["jobs"]["infer"]["done"].as_u64() < Some(VIEWS as u64), "{both}");
+    assert!(
+        both["state"] == "running" && both["jobs"]["infer"]["done"].as_u64() < Some(VIEWS as u64),
+        "{both}"
+    );
     let lost = scenario.wait_for("their loss", |s| !is_alive(s, "killed") && !is_alive(s, "cut"));
     assert!(lost["state"] == "running" && is_alive(&lost, "fuse"), "{lost}");
     assert_eq!(containers.state(&killed)["ExitCode"], 128 + 9);

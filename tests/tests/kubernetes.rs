@@ -47,5 +47,8 @@ fn manifests_meet_the_published_schemas() {
     }
     let checked = check(&python, &[folder.path().to_owned()]);
     let said = String::from_utf8_lossy(&checked.stderr);
-    assert!(!checked.status.success() && said.contains("Job worker") && said.contains("backofLimit"), "{said}");
+    assert!(
+        !checked.status.success() && said.contains("Job worker") && said.contains("backofLimit"),
+        "{said}"
+    );
 }

@@ -17,15 +17,20 @@ fn sbatch(name: &str) -> String {
     format!("{}/../deploy/slurm/{name}.sbatch", env!("CARGO_MANIFEST_DIR"))
 }
 
+/// Waits for a state; `folder` has the output of the jobs.
 #[track_caller]
-fn wait_for(what: &str, folder: &Path, is_there: impl FnMut() -> bool) {
-    let came = wait_until(DEADLINE, is_there);
+fn wait_for(what: &str, slurm: &Slurm, folder: &Path, mut is_there: impl FnMut() -> bool) {
+    let came = wait_until(DEADLINE, || {
+        // Each question is a process.
+        std::thread::sleep(Duration::from_millis(200));
+        is_there()
+    });
     let logs = || {
         let files = fs::read_dir(folder).into_iter().flatten().flatten();
         let logs = files.filter(|file| file.file_name().to_string_lossy().ends_with(".log"));
         logs.filter_map(|file| fs::read_to_string(file.path()).ok()).collect::<String>()
     };
-    assert!(came, "{what} does not come:\n{}", logs());
+    assert!(came, "{what} does not come:\n{}\n{}", logs(), slurm.describe());
 }
 
 #[test]
@@ -39,7 +44,8 @@ fn jobs_of_slurm_survive_preemption_and_time_limit() {
     let folder = Path::new(&shared);
     let port = free_port().to_string();
     let binaries = program().parent().expect("a program lies in a folder");
-    let path = [binaries.as_os_str(), std::env::var_os("PATH").unwrap_or_default().as_os_str()].join(OsStr::new(":"));
+    let path = [binaries.as_os_str(), std::env::var_os("PATH").unwrap_or_default().as_os_str()]
+        .join(OsStr::new(":"));
     let variables: [(&str, &OsStr); 4] = [
         ("PLANESWEEP_SHARED", shared.as_ref()),
         ("PLANESWEEP_HOST", "127.0.0.1".as_ref()),
@@ -50,7 +56,7 @@ fn jobs_of_slurm_survive_preemption_and_time_limit() {
     let worker = sbatch("worker");
     let workers = ["--array=0-1", "--cpus-per-task=1", &worker, "--device", "torch"];
     let workers = slurm.batch(folder, &workers, &variables);
-    wait_for("the coordinator's address", folder, || folder.join("address").exists());
+    wait_for("the coordinator's address", &slurm, folder, || folder.join("address").exists());
     let url = format!("http://127.0.0.1:{port}");
     let token = format!("{shared}/token");
     let struck = bench.submit("struck", &url, &[&SLOW[..], &["--token-file", &token]].concat());
@@ -58,19 +64,18 @@ fn jobs_of_slurm_survive_preemption_and_time_limit() {
         let done = |line: &str| line.split_once("/25 jobs").and_then(|(done, _)| done.parse::<u32>().ok());
         run.stderr().lines().filter_map(done).max().unwrap_or(0)
     };
-    wait_for("a result", folder, || results(&struck) >= 1);
+    wait_for("a result", &slurm, folder, || results(&struck) >= 1);
 
     // An urgent job takes all processors but the coordinator's.
     let urgent = slurm.batch(folder, &["--partition=urgent", "--ntasks=3", "--wrap=sleep 1"], &[]);
-    let is_preempted = || {
-        ["0", "1"].iter().all(|task| slurm.field(&format!("{workers}_{task}"), "Restarts") == "1")
-    };
-    wait_for("the preemption", folder, is_preempted);
-    wait_for("the urgent job's end", folder, || slurm.field(&urgent, "JobState") == "COMPLETED");
+    let is_preempted =
+        || ["0", "1"].iter().all(|task| slurm.field(&format!("{workers}_{task}"), "Restarts") == "1");
+    wait_for("the preemption", &slurm, folder, is_preempted);
+    wait_for("the urgent job's end", &slurm, folder, || slurm.field(&urgent, "JobState") == "COMPLETED");
 
     // What comes a minute before the time limit.
     slurm.ask("scancel", &["--batch", "--signal=TERM", &coordinator]);
-    wait_for("the requeue", folder, || slurm.field(&coordinator, "Restarts") == "1");
+    wait_for("the requeue", &slurm, folder, || slurm.field(&coordinator, "Restarts") == "1");
     let struck = struck.wait().expect_code(0);
     assert!(struck.stderr.contains("the coordinator is back"), "{}", struck.stderr);
     let cloud = bench.read("struck/cloud.ply");
@@ -78,7 +83,7 @@ fn jobs_of_slurm_survive_preemption_and_time_limit() {
 
     // The end: the coordinator takes its workers along.
     slurm.ask("scancel", &["--batch", "--signal=INT", &coordinator]);
-    wait_for("the end", folder, || slurm.ask("squeue", &["-h"]).is_empty());
+    wait_for("the end", &slurm, folder, || slurm.ask("squeue", &["-h"]).is_empty());
     for job in [&coordinator, &format!("{workers}_0"), &format!("{workers}_1")] {
         assert_eq!(slurm.field(job, "JobState"), "COMPLETED");
         assert_eq!(slurm.field(job, "ExitCode"), "0:0");
