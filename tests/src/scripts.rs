@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::{Command, Output};
 
 /// The exit code of a script that says: not on this machine.
-const UNAVAILABLE: i32 = 77;
+pub(crate) const UNAVAILABLE: i32 = 77;
 
 /// A script of the project.
 pub fn script(name: &str) -> PathBuf {

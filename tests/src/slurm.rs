@@ -10,7 +10,7 @@ use std::time::Duration;
 use tempfile::TempDir;
 
 use crate::faults::{send, wait_until};
-use crate::scripts::script;
+use crate::scripts::{UNAVAILABLE, script};
 
 /// How long the daemons may take to start, or to stop.
 const DAEMONS: Duration = Duration::from_mins(2);
@@ -22,7 +22,8 @@ pub struct Slurm {
 }
 
 impl Slurm {
-    /// `None`, and a line on stderr, where it cannot be started.
+    /// `None`, and a line on stderr, where there is none and none can be installed.
+    #[track_caller]
     pub fn new(test: &str) -> Option<Self> {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let log = fs::File::create(folder.path().join("log")).expect("a temporary file");
@@ -41,7 +42,9 @@ impl Slurm {
             return Some(made);
         }
         let said = fs::read_to_string(made.folder.path().join("log")).unwrap_or_default();
-        eprintln!("SKIPPED {test}: {}", said.lines().last().unwrap_or("Slurm does not start"));
+        let code = made.daemons.try_wait().expect("a child can be asked").and_then(|status| status.code());
+        assert_eq!(code, Some(UNAVAILABLE), "Slurm does not start: {said}\n{}", made.describe());
+        eprintln!("SKIPPED {test}: {}", said.lines().last().unwrap_or("no reason given"));
         None
     }
 
@@ -97,11 +100,13 @@ impl Slurm {
 
 impl Drop for Slurm {
     fn drop(&mut self) {
+        if self.has_ended() {
+            return;
+        }
         let _ = self.try_ask("scancel", &["--user", "root"]);
         let _ = wait_until(DAEMONS, || self.try_ask("squeue", &["-h"]).is_none_or(|jobs| jobs.is_empty()));
         send("TERM", self.daemons.id());
-        let has_ended = wait_until(DAEMONS, || self.has_ended());
-        if !has_ended {
+        if !wait_until(DAEMONS, || self.has_ended()) {
             send("KILL", self.daemons.id());
             let _ = self.daemons.wait();
         }

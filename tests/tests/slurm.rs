@@ -59,7 +59,7 @@ fn jobs_of_slurm_survive_preemption_and_time_limit() {
     wait_for("the coordinator's address", &slurm, folder, || folder.join("address").exists());
     let url = format!("http://127.0.0.1:{port}");
     let token = format!("{shared}/token");
-    let struck = bench.submit("struck", &url, &[&SLOW[..], &["--token-file", &token]].concat());
+    let mut struck = bench.submit("struck", &url, &[&SLOW[..], &["--token-file", &token]].concat());
     let results = |run: &Running| {
         let done = |line: &str| line.split_once("/25 jobs").and_then(|(done, _)| done.parse::<u32>().ok());
         run.stderr().lines().filter_map(done).max().unwrap_or(0)
@@ -69,13 +69,20 @@ fn jobs_of_slurm_survive_preemption_and_time_limit() {
     // An urgent job takes all processors but the coordinator's.
     let urgent = slurm.batch(folder, &["--partition=urgent", "--ntasks=3", "--wrap=sleep 1"], &[]);
     let is_preempted =
-        || ["0", "1"].iter().all(|task| slurm.field(&format!("{workers}_{task}"), "Restarts") == "1");
+        || ["0", "1"].iter().all(|task| slurm.field(&format!("{workers}_{task}"), "Restarts") != "0");
     wait_for("the preemption", &slurm, folder, is_preempted);
     wait_for("the urgent job's end", &slurm, folder, || slurm.field(&urgent, "JobState") == "COMPLETED");
 
+    let log = |task: u32| fs::read_to_string(folder.join(format!("planesweep-worker-{workers}-{task}.log")));
+    for task in [0, 1] {
+        let log = log(task).expect("a job has a log");
+        assert!(log.contains("stopped by SIGTERM"), "a worker was ended, not told to go: {log}");
+    }
+    assert!(struck.is_running(), "{}", struck.stderr());
+
     // What comes a minute before the time limit.
     slurm.ask("scancel", &["--batch", "--signal=TERM", &coordinator]);
-    wait_for("the requeue", &slurm, folder, || slurm.field(&coordinator, "Restarts") == "1");
+    wait_for("the requeue", &slurm, folder, || slurm.field(&coordinator, "Restarts") != "0");
     let struck = struck.wait().expect_code(0);
     assert!(struck.stderr.contains("the coordinator is back"), "{}", struck.stderr);
     let cloud = bench.read("struck/cloud.ply");
