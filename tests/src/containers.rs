@@ -21,10 +21,10 @@ pub struct Containers {
     /// Where a started engine listens; `None` for the host's own.
     socket: Option<PathBuf>,
     engine: Option<Child>,
-    _folder: TempDir,
+    folder: TempDir,
     /// Begins the names of this test's containers and networks, for the engine may serve others, too.
     prefix: String,
-    containers: Vec<String>,
+    started: Vec<String>,
     networks: Vec<String>,
 }
 
@@ -39,15 +39,15 @@ impl Containers {
         let mut made = Self {
             socket: None,
             engine: None,
-            _folder: folder,
+            folder,
             prefix: format!("planesweep-{}", std::process::id()),
-            containers: Vec::new(),
+            started: Vec::new(),
             networks: Vec::new(),
         };
         if made.answers() {
             return Some(made);
         }
-        let folder = made._folder.path().to_owned();
+        let folder = made.folder.path().to_owned();
         made.socket = Some(folder.join("docker.sock"));
         let log = fs::File::create(folder.join("log")).expect("a temporary file");
         let engine = Command::new(script("docker_engine.sh"))
@@ -123,7 +123,7 @@ impl Containers {
     #[track_caller]
     pub fn run(&mut self, name: &str, command: &[&str]) -> String {
         let full = format!("{}-{name}", self.prefix);
-        self.containers.push(full.clone());
+        self.started.push(full.clone());
         self.docker(&[&["run", "--name", &full, "--hostname", name], &LOCKED[..], command].concat());
         full
     }
@@ -144,7 +144,7 @@ impl Containers {
 
 impl Drop for Containers {
     fn drop(&mut self) {
-        for container in &self.containers {
+        for container in &self.started {
             let _ = self.try_docker(&["rm", "--force", "--volumes", container]);
         }
         for network in &self.networks {
