@@ -15,8 +15,8 @@ use crate::scripts::{script, unavailable};
 /// How long the engine may take to start, or to stop.
 const ENGINE: Duration = Duration::from_mins(2);
 
-/// The engine that runs on this host, or one that is started for the test and stopped after it; everything made
-/// through it is removed with it.
+/// The engine that runs on this host, or one that is started for the test and stopped after it; containers and
+/// networks made through it are removed with it.
 pub struct Containers {
     /// Where a started engine listens; `None` for the host's own.
     socket: Option<PathBuf>,
