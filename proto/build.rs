@@ -4,7 +4,8 @@ use std::error::Error;
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-changed=proto");
-    let files = protox::compile(["planesweep/v1/coordinator.proto"], ["proto"])?;
-    tonic_prost_build::configure().btree_map(".").compile_fds(files)?;
+    let contracts = ["planesweep/v1/coordinator.proto", "planesweep/v1/exchange.proto"];
+    let files = protox::compile(contracts, ["proto"])?;
+    tonic_prost_build::configure().btree_map(".").bytes(".planesweep.v1.FetchChunk").compile_fds(files)?;
     Ok(())
 }

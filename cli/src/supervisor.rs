@@ -4,6 +4,7 @@ use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 
 use anyhow::{Context, Result};
+use planesweep_proto::Role;
 use tokio::process::{Child, Command};
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
@@ -28,17 +29,17 @@ struct Orders {
 }
 
 impl Supervisor {
-    /// Starts `count` workers for the coordinator at `url`.
+    /// Starts a worker of each of these roles for the coordinator at `url`.
     ///
     /// Each holds the reading end of a pipe from this process, so it notices when this one is gone,
     /// however that happened.
-    pub fn start(count: u32, url: &str, placement: &Placement, verbose: u8) -> Result<Self> {
+    pub fn start(roles: &[Role], url: &str, placement: &Placement, verbose: u8) -> Result<Self> {
         let program = std::env::current_exe().context("cannot find the program to start workers with")?;
         let orders = Orders { stop: CancellationToken::new(), kill: CancellationToken::new() };
         let mut slots = JoinSet::new();
-        for slot in 0..count {
+        for (slot, role) in (0..).zip(roles) {
             let mut command = Command::new(&program);
-            command.args(["worker", "--stop-with-stdin", "--coordinator", url]);
+            command.args(["worker", "--stop-with-stdin", "--coordinator", url, "--role", &role.to_string()]);
             command.args(["--device", &placement.device, "--threads", &placement.threads.to_string()]);
             if let Some(bytes) = placement.memory_bytes {
                 command.args(["--memory", &bytes.to_string()]);

@@ -7,7 +7,9 @@ use std::time::Duration;
 
 use planesweep_plan::{Job, JobId, RunId};
 use planesweep_proto::wire::coordinator_server::CoordinatorServer;
-use planesweep_proto::{JobResult, Order, RunStatus, ServiceError, SubmitHeader, Submitted, check_jobs};
+use planesweep_proto::{
+    CheckToken, JobResult, Order, RunStatus, ServiceError, SubmitHeader, Submitted, check_jobs,
+};
 use thiserror::Error;
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
@@ -19,7 +21,7 @@ use tonic::transport::server::TcpIncoming;
 use crate::config::{Config, ConfigError};
 use crate::driver::{Driver, DriverHandle, Message, Settings};
 use crate::ledger::{Ledger, LedgerError};
-use crate::service::{CheckToken, Service, refusal};
+use crate::service::{Service, refusal};
 
 /// How often a connection is probed, and how long the answer may take.
 const KEEP_ALIVE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(5));

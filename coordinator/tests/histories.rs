@@ -312,12 +312,16 @@ impl World {
         let id = WorkerId(name);
         let commands = self.happen(Event::Reported {
             worker: id.clone(),
+            host: "host".to_owned(),
             ready: true,
             held: held.iter().map(|&(job, attempt)| Held { job, attempt, started: true }).collect(),
             finished,
         });
-        let grants =
-            self.happen(Event::WantsWork { worker: id, free: FreeSlots { infer: slots, fuse: slots } });
+        let grants = self.happen(Event::WantsWork {
+            worker: id,
+            free: FreeSlots { infer: slots, fuse: slots },
+            waiting: vec![],
+        });
         assert!(grants.len() <= 2 * slots as usize, "no more than asked for");
         if reply_lost {
             return;

@@ -5,7 +5,7 @@
 //! - `submit infer:a fuse:b<a` submits jobs; `b` needs `a`.
 //! - `w1 reports 1 infer 0 fuse; holds a#1 running, b#2; done c#1; failed d#1 retryable counts` is a
 //!   report and the wish for as many jobs; all parts but the slots may be left out, `draining` may
-//!   be added.
+//!   be added, and `while w2 w3 wait`. `w1@a` is a worker on host a; without that all are on one.
 //! - `clock +7s` lets time pass; `cancel a b`, `lost a b` and `restart` (of the coordinator) do as
 //!   they say.
 
@@ -55,13 +55,16 @@ impl Story {
                 self.snapshot = Snapshot::new(LEASE_MS, records, self.now);
                 Vec::new()
             }
-            worker => self.report(WorkerId(worker.to_owned()), rest),
+            worker => {
+                let (worker, host) = worker.split_once('@').unwrap_or((worker, "host"));
+                self.report(WorkerId(worker.to_owned()), host.to_owned(), rest)
+            }
         }
     }
 
-    fn report(&mut self, worker: WorkerId, text: &str) -> Vec<String> {
+    fn report(&mut self, worker: WorkerId, host: String, text: &str) -> Vec<String> {
         let (mut held, mut finished, mut ready) = (Vec::new(), Vec::new(), true);
-        let mut free = FreeSlots::default();
+        let (mut free, mut waiting) = (FreeSlots::default(), Vec::new());
         for part in text.split(';').map(str::trim) {
             let words: Vec<&str> = part.split_whitespace().collect();
             match words.as_slice() {
@@ -70,6 +73,9 @@ impl Story {
                     free.fuse = fuse.parse().expect("slots");
                 }
                 ["draining"] => ready = false,
+                ["while", workers @ .., "wait"] => {
+                    waiting = workers.iter().map(|worker| WorkerId((*worker).to_owned())).collect();
+                }
                 ["holds", ..] => {
                     held = part["holds".len()..].split(',').map(|text| held_job(text.trim())).collect();
                 }
@@ -92,8 +98,8 @@ impl Story {
                 _ => panic!("no such part of a report: {part}"),
             }
         }
-        let mut lines = self.happen(Event::Reported { worker: worker.clone(), ready, held, finished });
-        lines.extend(self.happen(Event::WantsWork { worker, free }));
+        let mut lines = self.happen(Event::Reported { worker: worker.clone(), host, ready, held, finished });
+        lines.extend(self.happen(Event::WantsWork { worker, free, waiting }));
         lines
     }
 

@@ -24,7 +24,7 @@ pub const TOKEN_HEADER: &str = "authorization";
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 /// How often an idle connection is probed, and how long the answer may take: a host that vanished
 /// without a word is noticed after both.
-const KEEP_ALIVE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(5));
+pub(crate) const KEEP_ALIVE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(5));
 /// How long a report may take beyond the time that the reply may be held back.
 const REPORT_TIMEOUT: Duration = Duration::from_secs(10);
 
@@ -39,6 +39,12 @@ pub fn bearer(token: &str) -> Result<MetadataValue<Ascii>, ServiceError> {
 /// Adds the token to every call.
 #[derive(Clone)]
 pub struct WithToken(Option<MetadataValue<Ascii>>);
+
+impl WithToken {
+    pub(crate) fn new(token: Option<MetadataValue<Ascii>>) -> Self {
+        Self(token)
+    }
+}
 
 impl tonic::service::Interceptor for WithToken {
     fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {

@@ -21,6 +21,12 @@ pub const MAX_SIDE: u32 = 1 << 17;
 pub const MAX_SLOTS: u32 = 256;
 /// Jobs that a worker may report as held, or as finished.
 pub const MAX_REPORTED: usize = 10_000;
+/// Other workers that one is told of at once.
+pub const MAX_PEERS: usize = 10_000;
+/// Bytes of a blob in one chunk on its way between workers.
+pub const FETCH_CHUNK_BYTES: usize = 256 << 10;
+/// Bytes of one message between workers: a chunk and its frame.
+pub const MAX_EXCHANGE_MESSAGE_BYTES: usize = FETCH_CHUNK_BYTES + 1024;
 /// Bytes of the name of a worker, host, run, device, failure code or measurement.
 pub const MAX_NAME_BYTES: usize = 255;
 /// Bytes of a path or of the name of an image.

@@ -39,6 +39,17 @@ pub struct Report {
     pub finished: Vec<FinishedJob>,
     /// How long the reply may be held back while there is nothing to say.
     pub max_wait: Duration,
+    /// Where other workers reach it.
+    pub endpoint: Endpoint,
+}
+
+/// Where a worker is reached by other workers.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Endpoint {
+    /// Serves what the worker has in memory, such as `http://10.0.0.2:7071`.
+    pub address: Option<String>,
+    /// Takes maps through shared memory: the name of a service on the worker's host.
+    pub inbox: Option<String>,
 }
 
 /// Which jobs a worker takes.
@@ -180,6 +191,17 @@ pub struct ReportReply {
     pub store_url: String,
     /// Whether to go on.
     pub order: Order,
+    /// The workers that made what the grants need, and those of the same host with an inbox.
+    pub peers: Vec<Peer>,
+}
+
+/// Another worker, and the ways on which this one can reach it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Peer {
+    /// The worker.
+    pub worker: WorkerId,
+    /// Its endpoint, without what cannot be reached.
+    pub endpoint: Endpoint,
 }
 
 /// What a worker is to do next.

@@ -24,6 +24,9 @@ pub struct RunReport {
     pub skipped: Vec<SkippedView>,
     /// What was odd about the scene as a whole.
     pub warnings: Vec<String>,
+    /// How many maps came to the jobs that needed them on each way, by the way's name.
+    #[serde(default)]
+    pub maps_by_way: BTreeMap<String, u64>,
     /// Sums.
     pub totals: Totals,
 }
@@ -189,6 +192,7 @@ pub(crate) mod tests {
                 reason: "no other view sees its points".into(),
             }],
             warnings: vec!["3 points have no track".into()],
+            maps_by_way: BTreeMap::from([("in process".into(), 11), ("by shared memory".into(), 3)]),
             totals: Totals { points: 54_600, wall_seconds: 143.5 },
         }
     }

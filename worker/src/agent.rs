@@ -18,9 +18,11 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use crate::device::{BackendFactory, Device};
+use crate::exchange::{Exchange, ExchangeConfig, ExchangeError};
 use crate::failure::JobError;
 use crate::held::Held;
 use crate::jobs::Jobs;
+use crate::maps::Maps;
 use crate::store::{Store, StoreError};
 
 /// The first report asks for an answer at once, for it brings the store's address.
@@ -48,8 +50,10 @@ pub struct WorkerConfig {
     pub device: String,
     /// Jobs it holds at once, by class.
     pub slots: Slots,
-    /// Budget of images in memory, and of depth maps, each.
+    /// Budget of images in memory, of depth maps, of filtered ones, and of maps in shared memory, each.
     pub cache_bytes: u64,
+    /// How it exchanges maps with other workers.
+    pub exchange: ExchangeConfig,
     /// Makes the network.
     pub backend: BackendFactory,
 }
@@ -78,6 +82,9 @@ pub enum WorkerError {
     /// The thread of the device cannot be started.
     #[error("cannot start the thread of the device")]
     Device(#[source] std::io::Error),
+    /// Its maps cannot be served to others.
+    #[error("cannot exchange maps with other workers")]
+    Exchange(#[from] ExchangeError),
 }
 
 /// Works until the coordinator says stop or `stop` is cancelled; a running job is ended first, what
@@ -86,6 +93,17 @@ pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result
     let client = Client::connect(&config.coordinator, config.token.as_deref())
         .map_err(|source| WorkerError::Refused { url: config.coordinator.clone(), source })?;
     let device = Device::start(config.backend).map_err(WorkerError::Device)?;
+    let maps = Arc::new(Maps::new(config.cache_bytes));
+    let exchange = Exchange::start(
+        &config.exchange,
+        &config.id,
+        &config.host,
+        config.role,
+        config.token,
+        Arc::clone(&maps),
+        config.cache_bytes,
+    )
+    .await?;
     let (events, inbox) = mpsc::channel(64);
     let agent = Agent {
         identity: Identity {
@@ -103,8 +121,9 @@ pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result
         held: Held::new(config.role, config.slots),
         tasks: BTreeMap::new(),
         events,
+        exchange: Arc::new(exchange),
         jobs: None,
-        unopened: Some((device, config.cache_bytes)),
+        unopened: Some((device, maps, config.cache_bytes)),
         max_wait: FIRST_WAIT,
         lease_ends: None,
         broken: None,
@@ -139,9 +158,10 @@ struct Agent {
     /// A way to give up each running job.
     tasks: BTreeMap<JobAttempt, CancellationToken>,
     events: mpsc::Sender<Event>,
+    exchange: Arc<Exchange>,
     /// Made with the first reply, which says where the store is.
     jobs: Option<Arc<Jobs>>,
-    unopened: Option<(Device, u64)>,
+    unopened: Option<(Device, Arc<Maps>, u64)>,
     max_wait: Duration,
     lease_ends: Option<Instant>,
     /// Why the device can do no further job.
@@ -239,6 +259,7 @@ impl Agent {
             held: self.held.held(),
             finished: self.held.finished(),
             max_wait: if self.state == WorkerState::Drained { Duration::ZERO } else { self.max_wait },
+            endpoint: self.exchange.endpoint(),
         }
     }
 
@@ -246,10 +267,12 @@ impl Agent {
     fn apply(&mut self, reply: ReportReply) -> Result<bool, WorkerError> {
         let first = self.unopened.take();
         let is_first = first.is_some();
-        if let Some((device, cache_bytes)) = first {
+        if let Some((device, maps, cache_bytes)) = first {
             let store = Store::open(&reply.store_url)?.patient(self.impatience.clone());
-            self.jobs = Some(Arc::new(Jobs::new(store, device, cache_bytes)));
+            let exchange = Arc::clone(&self.exchange);
+            self.jobs = Some(Arc::new(Jobs::new(store, device, cache_bytes, maps, exchange)));
         }
+        self.exchange.learn(&reply.peers);
         self.max_wait = reply.report_interval;
         for attempt in &reply.revoked {
             self.give_up(*attempt);

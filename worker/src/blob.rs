@@ -5,6 +5,7 @@
 //!         | payload, row by row from the top; all little-endian
 //! ```
 
+use bytes::BufMut;
 use nalgebra::{Matrix3, Vector3};
 use planesweep_fusion::{FilteredMapError, Funnel, VertexFormat};
 use planesweep_scene::{Camera, CameraError, DepthMap, DepthMapError, Intrinsics, Pose, Raster};
@@ -43,15 +44,17 @@ pub enum BlobError {
     DepthMap(#[from] DepthMapError),
 }
 
-/// A depth map as bytes.
-pub fn encode_depth_map(map: &DepthMap) -> Vec<u8> {
-    let pixels = map.width() * map.height();
-    let mut bytes = Vec::with_capacity(HEADER_BYTES + pixels * DEPTH_MAP_PIXEL_BYTES);
-    put_header(&mut bytes, DEPTH_MAP, &map.camera);
-    put_floats(&mut bytes, map.depth.values());
-    put_floats(&mut bytes, map.confidence.values());
-    bytes.extend_from_slice(map.color.values().as_flattened());
-    bytes
+/// A depth map as bytes, [`depth_map_bytes`] of them.
+pub fn encode_depth_map(map: &DepthMap, out: &mut dyn BufMut) {
+    put_header(out, DEPTH_MAP, &map.camera);
+    put_floats(out, map.depth.values());
+    put_floats(out, map.confidence.values());
+    out.put_slice(map.color.values().as_flattened());
+}
+
+/// How many bytes a depth map has.
+pub fn depth_map_bytes(map: &DepthMap) -> usize {
+    HEADER_BYTES + map.width() * map.height() * DEPTH_MAP_PIXEL_BYTES
 }
 
 /// A depth map from [`encode_depth_map`]'s bytes.
@@ -94,20 +97,27 @@ const FUNNEL_BYTES: usize = 6 * 8;
 const POINTS_HEADER_BYTES: usize = 8 + 2 + FUNNEL_BYTES;
 const DEPTH_MAP_PIXEL_BYTES: usize = 4 + 4 + 3;
 
-fn put_header(bytes: &mut Vec<u8>, magic: [u8; 8], camera: &Camera) {
+fn put_header(out: &mut dyn BufMut, magic: [u8; 8], camera: &Camera) {
     let k = &camera.intrinsics;
-    bytes.extend_from_slice(&magic);
-    bytes.extend_from_slice(&k.width.to_le_bytes());
-    bytes.extend_from_slice(&k.height.to_le_bytes());
+    out.put_slice(&magic);
+    out.put_u32_le(k.width);
+    out.put_u32_le(k.height);
     let inner = [k.fx, k.fy, k.skew, k.cx, k.cy];
     let pose = camera.pose.rotation.iter().chain(camera.pose.translation.iter());
     for value in inner.iter().chain(pose) {
-        bytes.extend_from_slice(&value.to_le_bytes());
+        out.put_f64_le(*value);
     }
 }
 
-fn put_floats(bytes: &mut Vec<u8>, values: &[f32]) {
-    bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+fn put_floats(out: &mut dyn BufMut, values: &[f32]) {
+    // In pieces that stay in the processor's nearest cache.
+    let mut piece = [[0; 4]; 1024];
+    for values in values.chunks(piece.len()) {
+        for (bytes, value) in piece.iter_mut().zip(values) {
+            *bytes = value.to_le_bytes();
+        }
+        out.put_slice(piece[..values.len()].as_flattened());
+    }
 }
 
 fn put_funnel(bytes: &mut Vec<u8>, funnel: &Funnel) {
@@ -233,13 +243,21 @@ mod tests {
         .expect("sizes agree")
     }
 
+    fn depth_map_as_bytes() -> Vec<u8> {
+        let mut bytes = Vec::new();
+        encode_depth_map(&depth_map(), &mut bytes);
+        bytes
+    }
+
     fn funnel() -> Funnel {
         Funnel { pixels: 48, with_depth: 47, photometric: 20, visible: 19, geometric: 9, emitted: 3 }
     }
 
     #[test]
     fn maps_survive_the_bytes() {
-        assert_eq!(decode_depth_map(&encode_depth_map(&depth_map())), Ok(depth_map()));
+        let bytes = depth_map_as_bytes();
+        assert_eq!(bytes.len(), depth_map_bytes(&depth_map()));
+        assert_eq!(decode_depth_map(&bytes), Ok(depth_map()));
     }
 
     #[test]
@@ -257,12 +275,12 @@ mod tests {
     fn one_kind_is_not_taken_for_the_other() {
         let points = encode_points(&funnel(), VertexFormat::default(), &[]);
         assert_eq!(decode_depth_map(&points), Err(BlobError::Kind { expected: "depth map" }));
-        assert!(decode_points(&encode_depth_map(&depth_map())).is_err());
+        assert!(decode_points(&depth_map_as_bytes()).is_err());
     }
 
     #[test]
     fn a_header_that_promises_too_much_is_refused_before_allocation() {
-        let mut bytes = encode_depth_map(&depth_map());
+        let mut bytes = depth_map_as_bytes();
         bytes[8..16].fill(0xff);
         assert!(matches!(decode_depth_map(&bytes), Err(BlobError::Length { .. })));
     }
@@ -270,7 +288,7 @@ mod tests {
     proptest! {
         #[test]
         fn truncation_and_damage_never_panic(cut in 0_usize..700, at in 0_usize..700, value: u8) {
-            let mut bytes = encode_depth_map(&depth_map());
+            let mut bytes = depth_map_as_bytes();
             let at = at % bytes.len();
             bytes[at] = value;
             bytes.truncate(bytes.len() - cut.min(bytes.len()));

@@ -113,7 +113,7 @@ impl JobError {
 }
 
 /// An error with what caused it, outermost first.
-fn with_causes(error: &dyn std::error::Error) -> String {
+pub(crate) fn with_causes(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();
     while let Some(inner) = cause {

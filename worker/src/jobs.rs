@@ -10,36 +10,20 @@ use planesweep_fusion::{
     filter,
 };
 use planesweep_plan::{BlobKey, EmitSpec, FilterSpec, InferSpec, JobId, JobSpec};
-use planesweep_proto::{Grant, Input, Success};
+use planesweep_proto::{Grant, Input, Produced, Success, Way};
 use planesweep_scene::DepthMap;
-use quick_cache::Weighter;
-use quick_cache::sync::Cache;
 use tokio::sync::Semaphore;
 use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
-use crate::blob::{decode_depth_map, encode_depth_map, encode_points};
-use crate::cache::cache;
+use crate::blob::{decode_depth_map, depth_map_bytes, encode_depth_map, encode_points};
 use crate::cloud::assemble;
 use crate::device::{Device, InferRequest};
+use crate::exchange::{Exchange, Written};
 use crate::failure::JobError;
 use crate::images::Images;
-use crate::store::Store;
-
-#[derive(Clone)]
-struct ByPixels;
-
-impl Weighter<BlobKey, Arc<DepthMap>> for ByPixels {
-    fn weight(&self, _: &BlobKey, map: &Arc<DepthMap>) -> u64 {
-        map.depth.values().len() as u64 * 11
-    }
-}
-
-impl Weighter<BlobKey, Arc<FilteredMap>> for ByPixels {
-    fn weight(&self, _: &BlobKey, map: &Arc<FilteredMap>) -> u64 {
-        map.depth.values().len() as u64 * 18
-    }
-}
+use crate::maps::Maps;
+use crate::store::{Store, StoreError};
 
 /// All that jobs share on a worker.
 pub(crate) struct Jobs {
@@ -48,24 +32,27 @@ pub(crate) struct Jobs {
     device: Device,
     /// One inference at a time; the next one loads its images meanwhile.
     device_turn: Semaphore,
-    maps: Cache<BlobKey, Arc<DepthMap>, ByPixels>,
-    filtered: Cache<BlobKey, Arc<FilteredMap>, ByPixels>,
+    maps: Arc<Maps>,
+    exchange: Arc<Exchange>,
 }
 
 /// The bytes of a result and what was measured on the way.
-type Made = (Vec<u8>, BTreeMap<String, f64>);
+type Made = (Written, BTreeMap<String, f64>);
+
+/// How many maps came on each way.
+type Ways = BTreeMap<Way, u32>;
 
 impl Jobs {
-    /// `cache_bytes` is the budget of images in memory, of depth maps, and of filtered ones, each.
-    pub fn new(store: Store, device: Device, cache_bytes: u64) -> Self {
-        Self {
-            store,
-            images: Images::new(cache_bytes),
-            device,
-            device_turn: Semaphore::new(1),
-            maps: cache(cache_bytes, ByPixels),
-            filtered: cache(cache_bytes, ByPixels),
-        }
+    /// `cache_bytes` is the budget of images in memory.
+    pub fn new(
+        store: Store,
+        device: Device,
+        cache_bytes: u64,
+        maps: Arc<Maps>,
+        exchange: Arc<Exchange>,
+    ) -> Self {
+        let images = Images::new(cache_bytes);
+        Self { store, images, device, device_turn: Semaphore::new(1), maps, exchange }
     }
 
     /// Does a job. `started` is called when computing begins; a job cancelled before its result is
@@ -77,7 +64,7 @@ impl Jobs {
         started: impl FnOnce(),
     ) -> Result<Success, JobError> {
         let begun = Instant::now();
-        let (bytes, measurements) = match &grant.spec {
+        let (written, measurements) = match &grant.spec {
             JobSpec::Infer(spec) => self.infer(spec, cancelled, started).await?,
             JobSpec::Stitch(_) => {
                 started();
@@ -97,8 +84,10 @@ impl Jobs {
             }
         };
         check(cancelled)?;
+        let bytes = written.bytes();
         let length = bytes.len() as u64;
-        let blob = self.store.put(bytes.into()).await.map_err(JobError::Store)?;
+        let blob = self.store.put(bytes).await.map_err(JobError::Store)?;
+        written.send(&blob);
         Ok(Success { blob, length, measurements, seconds: begun.elapsed().as_secs_f64() })
     }
 
@@ -131,34 +120,39 @@ impl Jobs {
         let map = self.device.infer(request).await?;
         drop(turn);
         let network_seconds = ("network_seconds".to_owned(), begun.elapsed().as_secs_f64());
-        Ok((self.keep(map), BTreeMap::from([network_seconds])))
+        Ok((self.keep(map).await, BTreeMap::from([network_seconds])))
     }
 
     async fn stitch(&self, inputs: &[Input]) -> Result<Made, JobError> {
+        let mut ways = Ways::new();
         let mut bands = Vec::with_capacity(inputs.len());
         for input in inputs {
-            bands.push(self.depth_map(input).await);
+            bands.push(self.depth_map(input, &mut ways).await);
         }
         let bands =
             all_or_lost(bands)?.into_iter().collect::<Option<Vec<_>>>().ok_or(JobError::NoDepthMap)?;
         let bands: Vec<DepthMap> = bands.iter().map(|band| DepthMap::clone(band)).collect();
-        Ok((self.keep(DepthMap::stitch(&bands)?), BTreeMap::new()))
+        Ok((self.keep(DepthMap::stitch(&bands)?).await, counted(&ways)))
     }
 
     /// The map as bytes. It stays in memory too, for neighbouring views filter against it soon.
-    fn keep(&self, map: DepthMap) -> Vec<u8> {
-        let bytes = encode_depth_map(&map);
-        self.maps.insert(BlobKey::of(&bytes), Arc::new(map));
-        bytes
+    async fn keep(&self, map: DepthMap) -> Written {
+        let map = Arc::new(map);
+        let source = Arc::clone(&map);
+        let written =
+            self.exchange.write(depth_map_bytes(&map), move |out| encode_depth_map(&source, out)).await;
+        self.maps.depth.insert(BlobKey::of(&written.bytes()), map);
+        written
     }
 
     async fn filter(&self, spec: &FilterSpec, inputs: &[Input]) -> Result<Made, JobError> {
         if inputs.is_empty() {
             return Err(JobError::NoDepthMap);
         }
+        let mut ways = Ways::new();
         let mut maps = Vec::with_capacity(inputs.len());
         for input in inputs {
-            maps.push(self.depth_map(input).await);
+            maps.push(self.depth_map(input, &mut ways).await);
         }
         let mut neighbours = all_or_lost(maps)?;
         let reference = neighbours.remove(0).ok_or(JobError::NoDepthMap)?;
@@ -177,18 +171,20 @@ impl Jobs {
             ("visible", visible),
             ("geometric", geometric),
         ];
-        let measurements = counts.map(|(name, count)| (name.to_owned(), count as f64)).into();
+        let mut measurements = counted(&ways);
+        measurements.extend(counts.map(|(name, count)| (name.to_owned(), count as f64)));
         let filtered = Arc::new(filtered);
         let bytes = encode_filtered_map(&filtered);
         // Neighbouring views ask soon who emits what: keep it.
-        self.filtered.insert(BlobKey::of(&bytes), filtered);
-        Ok((bytes, measurements))
+        self.maps.filtered.insert(BlobKey::of(&bytes), filtered);
+        Ok((bytes.into(), measurements))
     }
 
     async fn emit(&self, spec: &EmitSpec, inputs: &[Input]) -> Result<Made, JobError> {
+        let mut ways = Ways::new();
         let mut maps = Vec::with_capacity(inputs.len());
         for input in inputs {
-            maps.push(self.filtered_map(input).await);
+            maps.push(self.filtered_map(input, &mut ways).await);
         }
         let mut maps = all_or_lost(maps)?.into_iter();
         let map = maps.next().flatten().ok_or(JobError::NoDepthMap)?;
@@ -201,54 +197,76 @@ impl Jobs {
             (Funnel { emitted: points.len() as u64, ..map.funnel }, encode(&points, format))
         })
         .await;
-        let measurements = BTreeMap::from([("points".to_owned(), funnel.emitted as f64)]);
-        Ok((encode_points(&funnel, format, &vertices), measurements))
+        let mut measurements = counted(&ways);
+        measurements.insert("points".to_owned(), funnel.emitted as f64);
+        Ok((encode_points(&funnel, format, &vertices).into(), measurements))
     }
 
     async fn assemble(&self, inputs: &[Input]) -> Result<Made, JobError> {
         let mut clouds = Vec::with_capacity(inputs.len());
-        for input in inputs {
-            clouds.push(self.input(input).await.map(|bytes| Some((input.job, bytes?))));
+        for Input { job, produced } in inputs {
+            let Some(produced) = produced else { continue };
+            let bytes = self.store.get(&produced.blob).await.map_err(|source| unreadable(*job, source));
+            clouds.push(bytes.map(|bytes| (*job, bytes)));
         }
-        let clouds: Vec<(JobId, Bytes)> = all_or_lost(clouds)?.into_iter().flatten().collect();
+        let clouds: Vec<(JobId, Bytes)> = all_or_lost(clouds)?;
         compute(move || {
             let (bytes, points) = assemble(&clouds)?;
-            Ok((bytes, BTreeMap::from([("points".to_owned(), points as f64)])))
+            Ok((bytes.into(), BTreeMap::from([("points".to_owned(), points as f64)])))
         })
         .await
     }
 
-    /// The result of a needed job; `None` when that job failed for good.
-    async fn input(&self, input: &Input) -> Result<Option<Bytes>, JobError> {
+    /// The map that a needed job made; `None` when that job failed for good.
+    async fn depth_map(&self, input: &Input, ways: &mut Ways) -> Result<Option<Arc<DepthMap>>, JobError> {
         let Some(produced) = &input.produced else { return Ok(None) };
-        match self.store.get(&produced.blob).await {
-            Ok(bytes) => Ok(Some(bytes)),
-            Err(source) if source.is_lost() => Err(JobError::Lost { jobs: vec![input.job] }),
-            Err(source) => Err(JobError::Input { job: input.job, source }),
-        }
-    }
-
-    async fn depth_map(&self, input: &Input) -> Result<Option<Arc<DepthMap>>, JobError> {
-        let Some(produced) = &input.produced else { return Ok(None) };
+        let mut way = Way::Process;
         let read = async {
-            let bytes = self.input(input).await?.unwrap_or_default();
+            let bytes = self.fetch(input.job, produced, &mut way).await?;
             let map =
                 decode_depth_map(&bytes).map_err(|source| JobError::Malformed { job: input.job, source })?;
-            Ok(Arc::new(map))
+            Ok::<_, JobError>(Arc::new(map))
         };
-        self.maps.get_or_insert_async(&produced.blob, read).await.map(Some)
+        let map = self.maps.depth.get_or_insert_async(&produced.blob, read).await?;
+        *ways.entry(way).or_default() += 1;
+        Ok(Some(map))
     }
 
-    async fn filtered_map(&self, input: &Input) -> Result<Option<Arc<FilteredMap>>, JobError> {
+    async fn filtered_map(
+        &self,
+        input: &Input,
+        ways: &mut Ways,
+    ) -> Result<Option<Arc<FilteredMap>>, JobError> {
         let Some(produced) = &input.produced else { return Ok(None) };
+        let mut way = Way::Process;
         let read = async {
-            let bytes = self.input(input).await?.unwrap_or_default();
+            let bytes = self.fetch(input.job, produced, &mut way).await?;
             let map = decode_filtered_map(&bytes)
                 .map_err(|source| JobError::Malformed { job: input.job, source: source.into() })?;
-            Ok(Arc::new(map))
+            Ok::<_, JobError>(Arc::new(map))
         };
-        self.filtered.get_or_insert_async(&produced.blob, read).await.map(Some)
+        let map = self.maps.filtered.get_or_insert_async(&produced.blob, read).await?;
+        *ways.entry(way).or_default() += 1;
+        Ok(Some(map))
     }
+
+    /// The bytes of a map that is not in this process' memory.
+    async fn fetch(&self, job: JobId, produced: &Produced, way: &mut Way) -> Result<Bytes, JobError> {
+        let fetched = self.exchange.get(produced, &self.store).await;
+        let (bytes, came) = fetched.map_err(|source| unreadable(job, source))?;
+        *way = came;
+        Ok(bytes)
+    }
+}
+
+/// What follows when the result of a needed job cannot be read.
+fn unreadable(job: JobId, source: StoreError) -> JobError {
+    if source.is_lost() { JobError::Lost { jobs: vec![job] } } else { JobError::Input { job, source } }
+}
+
+/// The ways as measurements.
+fn counted(ways: &Ways) -> BTreeMap<String, f64> {
+    ways.iter().map(|(way, maps)| (way.measurement().to_owned(), f64::from(*maps))).collect()
 }
 
 /// All values, or one error that names every lost result, so that all are made again at once.
@@ -270,6 +288,6 @@ fn check(cancelled: &CancellationToken) -> Result<(), JobError> {
 }
 
 /// Runs something long outside the threads that keep the heartbeat going.
-async fn compute<T: Send + 'static>(f: impl FnOnce() -> T + Send + 'static) -> T {
+pub(crate) async fn compute<T: Send + 'static>(f: impl FnOnce() -> T + Send + 'static) -> T {
     spawn_blocking(f).await.expect("computing does not panic")
 }

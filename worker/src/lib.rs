@@ -5,6 +5,7 @@
 //!                   │ spawns
 //!                   └─> jobs (one job from grant to stored result)
 //!                         ├─ images ── device (one thread owns the network)
+//!                         ├─ maps (decoded, in memory) ── exchange (from and to other workers)
 //!                         ├─ cloud
 //!                         └─ planesweep_store (the truth of every result) ── blob (maps as bytes)
 //! ```
@@ -18,13 +19,16 @@ mod blob;
 mod cache;
 mod cloud;
 mod device;
+mod exchange;
 mod failure;
 mod held;
 mod images;
 mod jobs;
+mod maps;
 
 use planesweep_store as store;
 
 pub use agent::{WorkerConfig, WorkerError, run_worker};
 pub use blob::{BlobError, decode_depth_map};
 pub use device::BackendFactory;
+pub use exchange::{ExchangeConfig, ExchangeError};

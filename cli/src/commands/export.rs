@@ -8,7 +8,7 @@ use anyhow::{Context, Result, bail};
 use bytes::Bytes;
 use planesweep_fusion::{VertexFormat, decode_filtered_map};
 use planesweep_plan::{BlobKey, Job, JobId, NUMERICS_VERSION, ViewPlan, sparse_depths};
-use planesweep_proto::{CODE_VERSION, JobResult, JobState};
+use planesweep_proto::{CODE_VERSION, JobResult, JobState, maps_by_way};
 use planesweep_report::{
     Funnel, Pictures, RunReport, SkippedView, StageReport, Totals, ViewReport, encode_png, render_cloud,
     render_html,
@@ -115,6 +115,9 @@ pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Out
         text.push_str(&format!("{seconds:8.1} s  {name}\n"));
     }
     text.push_str(&format!("{:8.1} s  in all\n", report.totals.wall_seconds));
+    let ways: Vec<String> =
+        maps_by_way(run.results).iter().map(|(way, maps)| format!("{maps} {way}")).collect();
+    text.push_str(&format!("maps reached the fusion: {}\n", ways.join(", ")));
     for view in &skipped {
         text.push_str(&format!("skipped: {}: {}\n", view.view, view.reason));
     }
@@ -352,6 +355,10 @@ fn report(
             .map(|s| SkippedView { name: s.view.clone(), reason: s.reason.clone() })
             .collect(),
         warnings: run.prepared.input.scene.warnings.iter().map(ToString::to_string).collect(),
+        maps_by_way: maps_by_way(run.results)
+            .into_iter()
+            .map(|(way, maps)| (way.to_string(), maps))
+            .collect(),
         totals: Totals { points, wall_seconds: begun.elapsed().as_secs_f64() },
     }
 }

@@ -8,7 +8,7 @@ use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
 use planesweep_coordinator::{Config, Coordinator};
 use planesweep_mvsnet::Refinement;
-use planesweep_proto::{Client, JobResult};
+use planesweep_proto::{Client, JobResult, Role};
 use planesweep_store::Store;
 
 use super::export::{self, Finished};
@@ -36,6 +36,10 @@ pub struct ReconstructArgs {
     /// Worker processes; by default as many as make the machine busy and fit into its memory.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=256))]
     pub workers: Option<u32>,
+    /// One more worker process does everything but inference, and the others only infer; their depth
+    /// maps reach it through shared memory. Changes no bit of the result.
+    #[arg(long)]
+    pub fusion_worker: bool,
     /// Threads of each worker's inference; by default the processors are shared evenly.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
@@ -54,7 +58,7 @@ pub struct ReconstructArgs {
 
 /// The worker processes of a run.
 struct Team {
-    workers: u32,
+    roles: Vec<Role>,
     placement: Placement,
     verbose: u8,
 }
@@ -88,9 +92,16 @@ pub fn run(args: &ReconstructArgs, json: bool, verbose: u8) -> Result<Outcome> {
 
     let (state, _lock) = open_state(&args.out, args.fresh)?;
     let runtime = tokio::runtime::Runtime::new().context("cannot start the runtime")?;
-    let team = Team { workers, placement, verbose };
+    let team = Team { roles: roles(workers, args.fusion_worker), placement, verbose };
     let (store, results) = runtime.block_on(compute(&state, &prepared, &team, &mut stages))?;
     export::run(&Finished::new(&args.out, &prepared, &store, &runtime, &results), stages, begun)
+}
+
+/// What each worker process does.
+fn roles(workers: u32, fusion_worker: bool) -> Vec<Role> {
+    let mut roles = vec![if fusion_worker { Role::Infer } else { Role::Both }; workers as usize];
+    roles.extend(fusion_worker.then_some(Role::Fuse));
+    roles
 }
 
 /// Has all jobs done by worker processes; returns their results, whose blobs are all in the store.
@@ -115,8 +126,8 @@ async fn compute(
     let mut supervisor = None;
     let start_workers = |_: &_| {
         if supervisor.is_none() {
-            let Team { workers, placement, verbose } = team;
-            supervisor = Some(Supervisor::start(*workers, &coordinator.url(), placement, *verbose)?);
+            let Team { roles, placement, verbose } = team;
+            supervisor = Some(Supervisor::start(roles, &coordinator.url(), placement, *verbose)?);
         }
         Ok(())
     };

@@ -2,12 +2,13 @@
 
 use std::fmt;
 use std::io::Read;
+use std::net::SocketAddr;
 
 use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
 use planesweep_plan::WorkerId;
 use planesweep_proto::{Role, Slots};
-use planesweep_worker::{WorkerConfig, WorkerError, run_worker};
+use planesweep_worker::{ExchangeConfig, WorkerConfig, WorkerError, run_worker};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
@@ -29,6 +30,13 @@ pub struct WorkerArgs {
     /// Which jobs it takes.
     #[arg(long, value_enum, default_value = "both")]
     pub role: RoleArg,
+    /// Where other workers fetch the maps that this one has in memory, such as 10.0.0.2:7071; port 0 takes
+    /// a free one. Beyond this host a token is needed.
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:0")]
+    pub listen: SocketAddr,
+    /// Send no maps through shared memory to the fusion worker of this host.
+    #[arg(long)]
+    pub no_shared_memory: bool,
     /// Where to infer: cpu, torch, cuda or cuda:N; `analytic` is a test double that knows a plane.
     #[arg(long, default_value = "cpu")]
     pub device: String,
@@ -105,6 +113,7 @@ pub fn run(args: WorkerArgs) -> Result<Outcome> {
         device: args.device,
         slots: SLOTS,
         cache_bytes: CACHE_BYTES,
+        exchange: ExchangeConfig { listen: args.listen, shared_memory: !args.no_shared_memory },
     };
     let id = config.id.0.clone();
     let runtime = tokio::runtime::Builder::new_multi_thread()

@@ -7,6 +7,7 @@
 
 mod carry_out;
 mod message;
+mod peers;
 mod repeats;
 mod report;
 mod runs;
@@ -23,6 +24,7 @@ use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
 pub(crate) use message::{DriverHandle, Fleet, Message};
+use peers::Place;
 use report::Parked;
 
 use crate::ledger::{Change, Changes, Ledger, LedgerError};
@@ -51,7 +53,7 @@ impl Settings {
 /// What is known of a worker beside its jobs.
 #[derive(Debug)]
 struct WorkerInfo {
-    host: String,
+    place: Place,
     role: Role,
     device: String,
     state: WorkerState,
@@ -224,7 +226,7 @@ impl Driver {
                 .iter()
                 .map(|(id, info)| WorkerStatus {
                     worker: id.clone(),
-                    host: info.host.clone(),
+                    host: info.place.host.clone(),
                     role: info.role,
                     device: info.device.clone(),
                     state: info.state,

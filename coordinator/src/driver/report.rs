@@ -2,11 +2,13 @@
 
 use planesweep_plan::{Attempt, JobId, WorkerId};
 use planesweep_proto::{
-    Code, Failure, Grant, Input, JobAttempt, Order, Outcome, Report, ReportReply, ServiceError, WorkerState,
+    Code, Failure, Grant, Input, JobAttempt, Order, Outcome, Peer, Report, ReportReply, ServiceError,
+    WorkerState,
 };
 
 use super::carry_out::Payload;
 use super::message::Reply;
+use super::peers::{Place, peers};
 use super::{Driver, WorkerInfo, describe};
 use crate::ledger::{LedgerError, Step};
 use crate::schedule::{Command, Ending, Event, Finished, FreeSlots, Held, Timestamp, decide};
@@ -34,7 +36,11 @@ impl Driver {
         self.workers.insert(
             report.worker.clone(),
             WorkerInfo {
-                host: report.host.clone(),
+                place: Place {
+                    host: report.host.clone(),
+                    boot_id: report.boot_id.clone(),
+                    endpoint: report.endpoint.clone(),
+                },
                 role: report.role,
                 device: report.device.clone(),
                 state: report.state,
@@ -71,6 +77,7 @@ impl Driver {
     async fn record(&mut self, report: &Report, now: Timestamp) -> Result<ReportReply, LedgerError> {
         let event = Event::Reported {
             worker: report.worker.clone(),
+            host: host_of(&report.boot_id, &report.host),
             ready: report.state == WorkerState::Ready,
             held: report
                 .held
@@ -89,7 +96,6 @@ impl Driver {
         };
         let outcomes = report.finished.iter().map(|f| ((f.job, f.attempt), &f.outcome)).collect();
         let payload = Payload { outcomes, ..Payload::default() };
-        let wants = Event::WantsWork { worker: report.worker.clone(), free: slots(report) };
         if self.seen.is_none() {
             self.catch_up().await?;
         }
@@ -100,6 +106,7 @@ impl Driver {
                 self.snapshot.apply(command, now);
             }
             let mut answer = self.answer(report.offset_ms, &[]);
+            let wants = self.wants_work(&report.worker, slots(report));
             if self.order == Order::Work {
                 answer.grants = self.grant_alone(wants, now).await?;
             }
@@ -109,6 +116,7 @@ impl Driver {
         let commands = decide(&self.snapshot, event, now);
         self.carry_out(&mut step, &commands, &payload, now).await?;
         let mut answer = self.answer(report.offset_ms, &commands);
+        let wants = self.wants_work(&report.worker, slots(report));
         if self.order == Order::Work {
             answer.grants = self.grant(&mut step, wants, now).await?;
         }
@@ -182,7 +190,7 @@ impl Driver {
                 continue;
             }
             if may_grant {
-                let wants = Event::WantsWork { worker: worker.clone(), free: parked.free };
+                let wants = self.wants_work(&worker, parked.free);
                 match self.grant_alone(wants, now).await {
                     Ok(grants) => parked.answer.grants = grants,
                     Err(error) => {
@@ -197,6 +205,13 @@ impl Driver {
                 self.send(&worker, parked.answer, parked.reply);
             }
         }
+    }
+
+    fn wants_work(&self, worker: &WorkerId, free: FreeSlots) -> Event {
+        let waiting =
+            self.parked.iter().filter(|(_, parked)| parked.free.fuse > 0 && !parked.reply.is_closed());
+        let waiting = waiting.map(|(other, _)| other.clone()).collect();
+        Event::WantsWork { worker: worker.clone(), free, waiting }
     }
 
     async fn grant_alone(&mut self, wants: Event, now: Timestamp) -> Result<Vec<Grant>, LedgerError> {
@@ -216,12 +231,22 @@ impl Driver {
         reply: Reply<Result<ReportReply, ServiceError>>,
     ) {
         answer.order = self.order;
+        answer.peers = self.peers_of(worker, &answer.grants);
         if self.order == Order::Stop {
             self.told_to_stop.insert(worker.clone());
         }
         // A caller that has gone meanwhile does not speak of these grants in its next report, so
         // they are taken back then.
         let _ = reply.send(Ok(answer));
+    }
+
+    /// Whom the worker may fetch the inputs of its grants from, and send its maps to.
+    fn peers_of(&self, worker: &WorkerId, grants: &[Grant]) -> Vec<Peer> {
+        let Some(WorkerInfo { place, .. }) = self.workers.get(worker) else { return Vec::new() };
+        let inputs = grants.iter().flat_map(|grant| &grant.inputs);
+        let producers = inputs.filter_map(|input| Some(input.produced.as_ref()?.worker.clone())).collect();
+        let living = self.workers.iter().filter(|(other, _)| self.snapshot.is_alive(other));
+        peers(living.map(|(other, info)| (other, &info.place)), worker, place, &producers)
     }
 
     /// What the worker is told of the commands that followed from its report.
@@ -243,8 +268,14 @@ impl Driver {
             acknowledged: commands.iter().filter_map(acknowledged).collect(),
             store_url: self.settings.store_url.clone(),
             order: self.order,
+            peers: Vec::new(),
         }
     }
+}
+
+/// What workers have in common that can reach each other's memory. Containers have the boot id of their host.
+fn host_of(boot_id: &str, name: &str) -> String {
+    if boot_id.is_empty() { name.to_owned() } else { boot_id.to_owned() }
 }
 
 fn slots(report: &Report) -> FreeSlots {

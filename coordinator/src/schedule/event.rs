@@ -102,6 +102,8 @@ pub enum Event {
     Reported {
         /// Who.
         worker: WorkerId,
+        /// Where it is: workers of one host reach each other's memory.
+        host: String,
         /// Whether it is going to take more jobs.
         ready: bool,
         /// What it holds.
@@ -115,6 +117,8 @@ pub enum Event {
         worker: WorkerId,
         /// For how many.
         free: FreeSlots,
+        /// Who else waits for jobs other than inference.
+        waiting: Vec<WorkerId>,
     },
     /// Time passed.
     Tick,
@@ -169,6 +173,8 @@ pub enum Command {
     Admit {
         /// The worker.
         worker: WorkerId,
+        /// Where it is.
+        host: String,
         /// Whether it takes jobs.
         ready: bool,
         /// When its leases end unless it reports.

@@ -56,10 +56,12 @@ pub const MAX_DEATHS_ALONE: u32 = 3;
 pub fn decide(snapshot: &Snapshot, event: Event, now: Timestamp) -> Vec<Command> {
     match event {
         Event::Submitted { jobs } => submit::submitted(snapshot, jobs),
-        Event::Reported { worker, ready, held, finished } => {
-            report::reported(snapshot, &worker, ready, &held, &finished, now)
+        Event::Reported { worker, host, ready, held, finished } => {
+            report::reported(snapshot, (&worker, host), ready, &held, &finished, now)
         }
-        Event::WantsWork { worker, free } => assign::wants_work(snapshot, &worker, free, now),
+        Event::WantsWork { worker, free, waiting } => {
+            assign::wants_work(snapshot, &worker, free, &waiting, now)
+        }
         // No other try would read more; without it the jobs that need it go on.
         Event::Unreadable { job, attempt } => vec![Command::GiveUp { job, attempt, quarantined: false }],
         Event::Tick => lease::tick(snapshot, now),

@@ -11,14 +11,14 @@ use super::{Command, Ending, Finished, Held, MAX_FAILURES, MAX_LOSSES, Reopening
 /// does not speak is taken back: the reply that granted it was lost on the way.
 pub(super) fn reported(
     snapshot: &Snapshot,
-    worker: &WorkerId,
+    (worker, host): (&WorkerId, String),
     ready: bool,
     held: &[Held],
     finished: &[Finished],
     now: Timestamp,
 ) -> Vec<Command> {
     let deadline = now.plus(snapshot.lease_ms);
-    let mut commands = vec![Command::Admit { worker: worker.clone(), ready, deadline }];
+    let mut commands = vec![Command::Admit { worker: worker.clone(), host, ready, deadline }];
     for Finished { job, attempt, ending } in finished {
         commands.push(Command::Acknowledge { job: *job, attempt: *attempt });
         let known = snapshot.get(job);
@@ -114,6 +114,13 @@ mod tests {
     fn a_store_that_loses_everything_ends_the_job_at_last() {
         let (map, filter) = (JobId([0; 32]), JobId([1; 32]));
         let worker = WorkerId("w".to_owned());
+        let reports = |finished| Event::Reported {
+            worker: worker.clone(),
+            host: "host".to_owned(),
+            ready: true,
+            held: vec![],
+            finished,
+        };
         let mut now = Timestamp(0);
         let mut snapshot = Snapshot::new(7000, [], now);
         let mut happen = |event: Event, now| {
@@ -128,12 +135,10 @@ mod tests {
         let mut finished = Vec::new();
         for losses in 1.. {
             for job in [map, filter] {
-                happen(Event::Reported { worker: worker.clone(), ready: true, held: vec![], finished }, now);
+                happen(reports(finished), now);
                 now = now.plus(2000);
-                happen(
-                    Event::WantsWork { worker: worker.clone(), free: FreeSlots { infer: 0, fuse: 1 } },
-                    now,
-                );
+                let free = FreeSlots { infer: 0, fuse: 1 };
+                happen(Event::WantsWork { worker: worker.clone(), free, waiting: vec![] }, now);
                 let ending = if job == map {
                     Ending::Success
                 } else {
@@ -141,8 +146,7 @@ mod tests {
                 };
                 finished = vec![Finished { job, attempt: Attempt(losses), ending }];
             }
-            let commands =
-                happen(Event::Reported { worker: worker.clone(), ready: true, held: vec![], finished }, now);
+            let commands = happen(reports(finished), now);
             finished = Vec::new();
             let given_up = commands.iter().any(|command| matches!(command, Command::GiveUp { .. }));
             assert_eq!(given_up, losses == MAX_LOSSES, "after {losses} losses: {commands:?}");

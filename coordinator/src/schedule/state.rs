@@ -60,6 +60,15 @@ pub(super) struct Job {
     pub suspect: bool,
     pub deaths_alone: u32,
     pub outdated: bool,
+    /// Who made its result, as an index into [`Snapshot::makers`], if that is known.
+    maker: Option<u32>,
+}
+
+/// A worker that made a result, and may still have it in memory.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Maker {
+    pub worker: WorkerId,
+    pub host: String,
 }
 
 /// Where a job stands; fields exist only in the states that have them.
@@ -96,6 +105,8 @@ pub(super) struct Worker {
     /// Whether it reported since the coordinator started. One that did not is known by its leases
     /// only; that it is gone says nothing about its jobs, for the whole host may have gone.
     pub reported: bool,
+    /// Where it is.
+    pub host: String,
     /// What it holds, in the order of the grants.
     pub holds: Vec<Ordinal>,
     /// The job granted last, by class: its neighbours share images with it.
@@ -112,6 +123,8 @@ pub struct Snapshot {
     /// Open jobs without unmet needs, by class, in plan order; suspects are in `suspects` instead.
     pub(super) ready: BTreeMap<Class, BTreeSet<Ordinal>>,
     pub(super) suspects: BTreeSet<Ordinal>,
+    /// Every worker that completed a job since the coordinator started.
+    makers: Vec<Maker>,
 }
 
 impl Snapshot {
@@ -128,6 +141,7 @@ impl Snapshot {
             workers: BTreeMap::new(),
             ready: BTreeMap::new(),
             suspects: BTreeSet::new(),
+            makers: Vec::new(),
         };
         for record in records {
             snapshot.add(record, now);
@@ -195,6 +209,24 @@ impl Snapshot {
     /// How many jobs a worker holds.
     pub fn held_by(&self, worker: &WorkerId) -> usize {
         self.workers.get(worker).map_or(0, |worker| worker.holds.len())
+    }
+
+    /// Who made the result that a done job has now, if this coordinator saw it.
+    pub(super) fn maker(&self, job: Ordinal) -> Option<&Maker> {
+        let job = &self.jobs[job as usize];
+        let maker = job.maker.filter(|_| job.state == State::Done)?;
+        self.makers.get(maker as usize)
+    }
+
+    /// A number for the worker; the latest are looked at first, for they are the ones that live.
+    fn note_maker(&mut self, worker: &WorkerId) -> u32 {
+        let known = self.makers.iter().rposition(|maker| maker.worker == *worker);
+        let at = known.unwrap_or_else(|| {
+            let host = self.workers.get(worker).map(|worker| worker.host.clone()).unwrap_or_default();
+            self.makers.push(Maker { worker: worker.clone(), host });
+            self.makers.len() - 1
+        });
+        at as u32
     }
 
     pub(super) fn get(&self, job: &JobId) -> Option<&Job> {
@@ -289,9 +321,10 @@ impl Snapshot {
                 !self.knows(&shape.id) && self.add(JobRecord::new(shape.clone()), now)
             }
             Command::Reopen { job, why } => self.reopen(job, *why),
-            Command::Admit { worker, ready, deadline } => {
+            Command::Admit { worker, host, ready, deadline } => {
                 let worker = self.workers.entry(worker.clone()).or_insert_with(|| Worker::new(*deadline));
                 (worker.ready, worker.deadline, worker.reported) = (*ready, *deadline, true);
+                worker.host.clone_from(host);
                 true
             }
             Command::Renew { job, attempt, worker, started, .. } => {
@@ -302,7 +335,14 @@ impl Snapshot {
                 })
             }
             Command::Grant { job, attempt, worker, .. } => self.grant(job, *attempt, worker),
-            Command::Complete { job, attempt, worker } => self.end(job, *attempt, Some(worker), State::Done),
+            Command::Complete { job, attempt, worker } => {
+                self.end(job, *attempt, Some(worker), State::Done) && {
+                    let maker = self.note_maker(worker);
+                    let ordinal = self.ordinals[job];
+                    self.jobs[ordinal as usize].maker = Some(maker);
+                    true
+                }
+            }
             Command::GiveUp { job, attempt, .. } => self.end(job, *attempt, None, State::Failed),
             Command::Retry { job, attempt, failures, losses, until } => {
                 self.take_back(job, *attempt, *until, |job| {
@@ -355,6 +395,7 @@ impl Snapshot {
             suspect,
             deaths_alone,
             outdated,
+            maker: None,
         });
         if is_open {
             self.enter_open(ordinal, now);
@@ -529,6 +570,7 @@ impl JobRecord {
 
 impl Worker {
     fn new(deadline: Timestamp) -> Self {
-        Self { deadline, ready: false, reported: false, holds: Vec::new(), last: BTreeMap::new() }
+        let (holds, last) = (Vec::new(), BTreeMap::new());
+        Self { deadline, ready: false, reported: false, host: String::new(), holds, last }
     }
 }

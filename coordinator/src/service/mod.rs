@@ -1,6 +1,5 @@
 //! The gRPC handlers: decode, hand to the driver or the ledger, encode. No decisions.
 
-mod auth;
 mod report;
 mod runs;
 
@@ -13,8 +12,6 @@ use planesweep_proto::wire::coordinator_server::{Coordinator, CoordinatorServer}
 use planesweep_proto::{CODE_VERSION, Code, PROTOCOL_VERSION, ServiceError, wire};
 use tokio_stream::Stream;
 use tonic::{Request, Response, Status, Streaming};
-
-pub(crate) use auth::CheckToken;
 
 use crate::driver::{DriverHandle, describe};
 use crate::ledger::{Ledger, LedgerError};

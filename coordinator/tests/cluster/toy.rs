@@ -10,8 +10,8 @@ use planesweep_plan::{
     NUMERICS_VERSION, RunId, WorkerId,
 };
 use planesweep_proto::{
-    CODE_VERSION, Client, FinishedJob, Grant, HeldJob, Order, Outcome, PROTOCOL_VERSION, Report, ReportReply,
-    Role, RunStatus, ServiceError, Slots, SubmitHeader, Success, WorkerState,
+    CODE_VERSION, Client, Endpoint, FinishedJob, Grant, HeldJob, Order, Outcome, PROTOCOL_VERSION, Report,
+    ReportReply, Role, RunStatus, ServiceError, Slots, SubmitHeader, Success, WorkerState,
 };
 use planesweep_scene::{Camera, DepthHypotheses, Distortion, Intrinsics, Pose, Sampling, ViewId};
 use tempfile::TempDir;
@@ -126,6 +126,7 @@ impl Toy {
             held: self.held.clone(),
             finished: self.finished.clone(),
             max_wait: LEASE,
+            endpoint: Endpoint::default(),
         };
         let reply = self.client.report(&report).await?;
         assert_eq!(reply.offset_ms, self.sequence, "the offset is echoed");

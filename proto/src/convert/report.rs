@@ -9,11 +9,11 @@ use super::check::{
     required, short,
 };
 use crate::limits::{
-    MAX_MEASUREMENTS, MAX_MESSAGE_TEXT_BYTES, MAX_NAME_BYTES, MAX_REPORTED, MAX_SLOTS, MAX_VIEWS,
+    MAX_MEASUREMENTS, MAX_MESSAGE_TEXT_BYTES, MAX_NAME_BYTES, MAX_PEERS, MAX_REPORTED, MAX_SLOTS, MAX_VIEWS,
 };
 use crate::{
-    Failure, FinishedJob, Grant, HeldJob, Input, JobAttempt, Order, Outcome, Produced, Report, ReportReply,
-    Role, Slots, Success, WireError, WorkerState, wire,
+    Endpoint, Failure, FinishedJob, Grant, HeldJob, Input, JobAttempt, Order, Outcome, Peer, Produced,
+    Report, ReportReply, Role, Slots, Success, WireError, WorkerState, wire,
 };
 
 impl From<&Report> for wire::ReportRequest {
@@ -34,6 +34,8 @@ impl From<&Report> for wire::ReportRequest {
             held: report.held.iter().map(|job| (*job).into()).collect(),
             finished: report.finished.iter().map(Into::into).collect(),
             max_wait_ms: millis(report.max_wait),
+            address: report.endpoint.address.clone().unwrap_or_default(),
+            inbox: report.endpoint.inbox.clone().unwrap_or_default(),
         }
     }
 }
@@ -64,6 +66,36 @@ impl TryFrom<wire::ReportRequest> for Report {
             held: each(report.held, TryInto::try_into)?,
             finished: each(report.finished, TryInto::try_into)?,
             max_wait: Duration::from_millis(report.max_wait_ms.into()),
+            endpoint: endpoint(report.address, report.inbox)?,
+        })
+    }
+}
+
+fn endpoint(address: String, inbox: String) -> Result<Endpoint, WireError> {
+    let present = |text: String| (!text.is_empty()).then_some(text);
+    Ok(Endpoint {
+        address: present(optional_name("address", address)?),
+        inbox: present(optional_name("inbox", inbox)?),
+    })
+}
+
+impl From<&Peer> for wire::Peer {
+    fn from(peer: &Peer) -> Self {
+        Self {
+            worker: peer.worker.0.clone(),
+            address: peer.endpoint.address.clone().unwrap_or_default(),
+            inbox: peer.endpoint.inbox.clone().unwrap_or_default(),
+        }
+    }
+}
+
+impl TryFrom<wire::Peer> for Peer {
+    type Error = WireError;
+
+    fn try_from(peer: wire::Peer) -> Result<Self, WireError> {
+        Ok(Self {
+            worker: WorkerId(name("peer", peer.worker)?),
+            endpoint: endpoint(peer.address, peer.inbox)?,
         })
     }
 }
@@ -210,6 +242,7 @@ impl From<&ReportReply> for wire::ReportReply {
             acknowledged: reply.acknowledged.iter().map(|job| (*job).into()).collect(),
             store_url: reply.store_url.clone(),
             order: order.into(),
+            peers: reply.peers.iter().map(Into::into).collect(),
         }
     }
 }
@@ -223,6 +256,7 @@ impl TryFrom<wire::ReportReply> for ReportReply {
         at_most("grants", reply.grants.len(), MAX_REPORTED)?;
         at_most("revoked", reply.revoked.len(), MAX_REPORTED)?;
         at_most("acknowledged", reply.acknowledged.len(), MAX_REPORTED)?;
+        at_most("peers", reply.peers.len(), MAX_PEERS)?;
         Ok(Self {
             offset_ms: reply.offset_ms,
             lease: positive("lease", reply.lease_ms)?,
@@ -237,6 +271,7 @@ impl TryFrom<wire::ReportReply> for ReportReply {
                 Ok(wire::Order::Stop) => Order::Stop,
                 _ => return Err(WireError::UnknownValue { field: "order", value: reply.order }),
             },
+            peers: each(reply.peers, TryInto::try_into)?,
         })
     }
 }
@@ -373,6 +408,10 @@ mod tests {
                     held,
                     finished,
                     max_wait: Duration::from_millis(wait.into()),
+                    endpoint: Endpoint {
+                        address: (wait > 9).then(|| "http://10.0.0.2:7071".into()),
+                        inbox: (infer > 0).then(|| "inbox".into()),
+                    },
                 }
             },
         )
@@ -403,8 +442,16 @@ mod tests {
                 .prop_map(|jobs| jobs.into_iter().map(|(job, attempt)| JobAttempt { job, attempt }).collect())
         };
         let order = prop_oneof![Just(Order::Work), Just(Order::Drain), Just(Order::Stop)];
-        (any::<u64>(), 1..u32::MAX, grants, attempts(), attempts(), order).prop_map(
-            |(offset_ms, ms, grants, revoked, acknowledged, order)| ReportReply {
+        let text = || proptest::option::of("[a-z:/0-9]{1,9}");
+        let peers = vec(("[a-z]{1,9}", text(), text()), 0..3).prop_map(|peers| {
+            let peer = |(worker, address, inbox)| Peer {
+                worker: WorkerId(worker),
+                endpoint: Endpoint { address, inbox },
+            };
+            peers.into_iter().map(peer).collect()
+        });
+        (any::<u64>(), 1..u32::MAX, grants, attempts(), attempts(), order, peers).prop_map(
+            |(offset_ms, ms, grants, revoked, acknowledged, order, peers)| ReportReply {
                 offset_ms,
                 lease: Duration::from_millis(ms.into()),
                 report_interval: Duration::from_millis(ms.into()),
@@ -413,6 +460,7 @@ mod tests {
                 acknowledged,
                 store_url: "file:///store".into(),
                 order,
+                peers,
             },
         )
     }

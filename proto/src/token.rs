@@ -1,13 +1,14 @@
 //! The token, checked before any body is read.
 
-use planesweep_proto::{Code, ServiceError, TOKEN_HEADER};
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
 use tonic::{Request, Status};
 
+use crate::{Code, ServiceError, TOKEN_HEADER};
+
 /// Refuses calls without the token, if there is one.
-#[derive(Clone)]
-pub(crate) struct CheckToken(pub Option<MetadataValue<Ascii>>);
+#[derive(Clone, Debug)]
+pub struct CheckToken(pub Option<MetadataValue<Ascii>>);
 
 impl Interceptor for CheckToken {
     fn call(&mut self, request: Request<()>) -> Result<Request<()>, Status> {
@@ -29,9 +30,8 @@ fn equal(a: &[u8], b: &[u8]) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use planesweep_proto::bearer;
-
     use super::*;
+    use crate::bearer;
 
     fn call(expected: Option<&str>, shown: Option<&str>) -> Result<(), tonic::Code> {
         let expected = expected.map(|token| bearer(token).expect("plain ASCII"));

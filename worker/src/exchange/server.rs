@@ -1,0 +1,124 @@
+//! What this worker has in memory, for others to fetch.
+
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use planesweep_plan::BlobKey;
+use planesweep_proto::limits::{FETCH_CHUNK_BYTES, MAX_EXCHANGE_MESSAGE_BYTES};
+use planesweep_proto::wire::exchange_server::{Exchange, ExchangeServer};
+use planesweep_proto::{CheckToken, Code, ServiceError, bearer, wire};
+use tokio::net::TcpListener;
+use tokio::sync::Semaphore;
+use tokio::task::spawn_blocking;
+use tokio_util::sync::{CancellationToken, DropGuard};
+use tonic::codegen::BoxStream;
+use tonic::service::interceptor::InterceptedService;
+use tonic::transport::Server;
+use tonic::transport::server::TcpIncoming;
+use tonic::{Request, Response, Status};
+
+use super::{ExchangeError, Inbox};
+use crate::maps::Maps;
+
+/// How often a connection is probed, and how long the answer may take.
+const KEEP_ALIVE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(5));
+/// Maps on their way at once, each as a whole in memory; who asks beyond that waits.
+const MAX_FETCHES: usize = 4;
+
+/// A server that stops when this is dropped.
+pub(crate) struct Served {
+    /// What others reach it by.
+    pub address: String,
+    _stop: DropGuard,
+}
+
+/// Serves maps, and the inbox if there is one. Beyond this host, only to those who have the token.
+pub(crate) async fn serve(
+    listen: SocketAddr,
+    host: &str,
+    token: Option<&str>,
+    maps: Arc<Maps>,
+    inbox: Option<Arc<Inbox>>,
+) -> Result<Served, ExchangeError> {
+    if !listen.ip().is_loopback() && token.is_none() {
+        return Err(ExchangeError::NoToken { listen });
+    }
+    let token = token.map(bearer).transpose().map_err(ExchangeError::Token)?;
+    let cannot_listen = |source: io::Error| ExchangeError::Listen { listen, source };
+    let listener = TcpListener::bind(listen).await.map_err(cannot_listen)?;
+    let local = listener.local_addr().map_err(cannot_listen)?;
+    // Whoever listens everywhere is found by the name of the host.
+    let address = if local.ip().is_unspecified() {
+        format!("http://{host}:{}", local.port())
+    } else {
+        format!("http://{local}")
+    };
+    let service = ExchangeServer::new(Service { maps, inbox, turns: Arc::new(Semaphore::new(MAX_FETCHES)) })
+        .max_decoding_message_size(MAX_EXCHANGE_MESSAGE_BYTES)
+        .max_encoding_message_size(MAX_EXCHANGE_MESSAGE_BYTES);
+    let stop = CancellationToken::new();
+    let stopped = stop.clone().cancelled_owned();
+    let server = Server::builder()
+        .tcp_nodelay(true)
+        .http2_keepalive_interval(Some(KEEP_ALIVE.0))
+        .http2_keepalive_timeout(Some(KEEP_ALIVE.1))
+        .add_service(InterceptedService::new(service, CheckToken(token)))
+        .serve_with_incoming_shutdown(TcpIncoming::from(listener).with_nodelay(Some(true)), stopped);
+    tokio::spawn(async move {
+        if let Err(error) = server.await {
+            tracing::warn!(%error, "maps are served no longer");
+        }
+    });
+    Ok(Served { address, _stop: stop.drop_guard() })
+}
+
+struct Service {
+    maps: Arc<Maps>,
+    inbox: Option<Arc<Inbox>>,
+    turns: Arc<Semaphore>,
+}
+
+#[tonic::async_trait]
+impl Exchange for Service {
+    type FetchStream = BoxStream<wire::FetchChunk>;
+
+    async fn fetch(
+        &self,
+        request: Request<wire::FetchRequest>,
+    ) -> Result<Response<Self::FetchStream>, Status> {
+        let key: [u8; 32] = (request.into_inner().blob.as_slice())
+            .try_into()
+            .map_err(|_| ServiceError::new(Code::Invalid, "a blob's key has 32 bytes"))?;
+        let turn = self.turns.clone().acquire_owned().await;
+        let turn = turn.map_err(|_| ServiceError::new(Code::Unavailable, "the worker is stopping"))?;
+        let maps = Arc::clone(&self.maps);
+        let bytes = spawn_blocking(move || maps.bytes_of(&BlobKey(key))).await;
+        let Ok(Some(mut bytes)) = bytes else {
+            let text = format!("blob {} is not in memory any more", BlobKey(key));
+            return Err(ServiceError::new(Code::NotFound, text).into());
+        };
+        // Chunks are taken when the reader has room for them.
+        let chunks = std::iter::from_fn(move || {
+            let _until_the_last = &turn;
+            (!bytes.is_empty()).then(|| {
+                let data = bytes.split_to(bytes.len().min(FETCH_CHUNK_BYTES));
+                Ok(wire::FetchChunk { data })
+            })
+        });
+        Ok(Response::new(Box::pin(tokio_stream::iter(chunks))))
+    }
+
+    async fn open_inbox(
+        &self,
+        request: Request<wire::OpenInboxRequest>,
+    ) -> Result<Response<wire::OpenInboxReply>, Status> {
+        let name = request.into_inner().inbox;
+        match self.inbox.as_ref().filter(|inbox| inbox.name() == name) {
+            Some(inbox) => inbox.receive(),
+            None => return Err(ServiceError::new(Code::NotFound, "this worker has no such inbox").into()),
+        }
+        Ok(Response::new(wire::OpenInboxReply {}))
+    }
+}
