@@ -52,26 +52,25 @@ impl Bench {
     /// Starts `planesweep reconstruct --json` into `out`, with `more` options in place of the easy ones
     /// of the same name, or after them.
     pub fn start(&self, out: &str, more: &[&str]) -> Running {
-        self.start_command(&[], "reconstruct", out, more)
+        Running::start(self.arguments("reconstruct", out, more))
+    }
+
+    /// The same by a shell script, which has the program in `"$0" "$@"`.
+    pub fn start_in_script(&self, script: &str, out: &str, more: &[&str]) -> Running {
+        Running::start_in_script(script, self.arguments("reconstruct", out, more))
     }
 
     /// The same with `planesweep submit` to a cluster.
     pub fn submit(&self, out: &str, cluster: &Cluster, more: &[&str]) -> Running {
         let more = [&["--coordinator", cluster.url()], more].concat();
-        self.start_command(cluster.environment(), "submit", out, &more)
+        Running::start_in(cluster.environment(), self.arguments("submit", out, &more))
     }
 
-    fn start_command(
-        &self,
-        environment: &[(&'static str, String)],
-        command: &str,
-        out: &str,
-        more: &[&str],
-    ) -> Running {
+    fn arguments(&self, command: &str, out: &str, more: &[&str]) -> Vec<String> {
         let (scene, out, weights) = (self.scene(), self.path(out), self.weights());
         let given = [command, &scene, "-o", &out, "--weights", &weights, "--json"];
         let easy = EASY.chunks(2).filter(|option| !more.contains(&option[0])).flatten();
-        Running::start_in(environment, given.iter().chain(easy).chain(more))
+        given.iter().chain(easy).chain(more).map(|argument| (*argument).to_owned()).collect()
     }
 
     /// [`Bench::start`], and waits for the end.

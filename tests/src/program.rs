@@ -62,9 +62,22 @@ impl Running {
         environment: &[(&'static str, String)],
         arguments: impl IntoIterator<Item = S>,
     ) -> Self {
+        Self::start_by(&mut Command::new(program()), environment, arguments)
+    }
+
+    /// Has a shell script start it, as `"$0" "$@"`.
+    pub fn start_in_script<S: AsRef<OsStr>>(script: &str, arguments: impl IntoIterator<Item = S>) -> Self {
+        Self::start_by(Command::new("sh").args(["-c", script]).arg(program()), &[], arguments)
+    }
+
+    fn start_by<S: AsRef<OsStr>>(
+        command: &mut Command,
+        environment: &[(&'static str, String)],
+        arguments: impl IntoIterator<Item = S>,
+    ) -> Self {
         let output = tempfile::tempdir().expect("a temporary folder");
         let file = |name: &str| File::create(output.path().join(name)).expect("a temporary file");
-        let child = Command::new(program())
+        let child = command
             .args(arguments)
             .env_remove("PLANESWEEP_WEIGHTS")
             .env_remove("PLANESWEEP_LOG")
