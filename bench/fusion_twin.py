@@ -4,7 +4,7 @@ Per reference view: every neighbour's depth is sampled at the projection of the 
 projected back; a neighbour agrees within 1 pixel and 1 % of the depth; pixels with a confidence of 0.8
 that 3 views agree on (the reference included) are kept, with the mean of the agreeing depths.
 
-Speaks lines: for each line on stdin the filter runs once, and a line with its seconds is printed. The
+Speaks lines: for each line on stdin the filter runs once, and a line with its seconds, by the clock and of CPU time, is printed. The
 last result is written to FOLDER/twin_depth.f32 and FOLDER/twin_views.u8 when stdin ends.
 
     python3 bench/fusion_twin.py FOLDER    (numpy, opencv-python-headless)
@@ -88,10 +88,10 @@ def main():
     fused = None
     print("ready", flush=True)
     for _ in sys.stdin:
-        begun = time.perf_counter()
+        begun, cpu = time.perf_counter(), time.process_time()
         with np.errstate(all="ignore"):
             fused = fuse(maps, confidence)
-        print(time.perf_counter() - begun, flush=True)
+        print(time.perf_counter() - begun, time.process_time() - cpu, flush=True)
     if fused is not None:
         fused[0].tofile(folder / "twin_depth.f32")
         fused[1].astype(np.uint8).tofile(folder / "twin_views.u8")

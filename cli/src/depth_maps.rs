@@ -24,6 +24,8 @@ pub struct DepthMaps {
     pub warnings: Vec<String>,
     /// The views without a depth map.
     pub without: Vec<String>,
+    /// Pixels of the maps to one of the network's maps.
+    pub network_pixel: f32,
 }
 
 /// Who is checked against whom.
@@ -46,7 +48,7 @@ pub fn find(
 ) -> Result<DepthMaps> {
     let is_result = folder.join(FILE_NAME).exists();
     let found = if is_result { of_result(folder, masks)? } else { of_mvsnet_folder(folder, masks, options)? };
-    let Found { files, mut ranking, warnings, without } = found;
+    let Found { files, mut ranking, warnings, without, network_pixel } = found;
     if files.is_empty() {
         bail!(
             "no depth map is in {}: depth/, depth_est/ or depths_mvsnet/ with ID.pfm or ID_init.pfm are looked for",
@@ -70,7 +72,7 @@ pub fn find(
             |sources: &Vec<SourceScore>| sources.iter().take(neighbourhood.count).map(|s| s.view).collect();
         ranking.iter().map(|(view, sources)| (*view, best(sources))).collect()
     };
-    Ok(DepthMaps { order: order_views(&ranking), files, neighbours, warnings, without })
+    Ok(DepthMaps { order: order_views(&ranking), files, neighbours, warnings, without, network_pixel })
 }
 
 struct Found {
@@ -78,6 +80,7 @@ struct Found {
     ranking: SourceRanking,
     warnings: Vec<String>,
     without: Vec<String>,
+    network_pixel: f32,
 }
 
 /// Of a folder that `reconstruct` made: its record knows everything.
@@ -97,7 +100,11 @@ fn of_result(folder: &Path, masks: Option<&Path>) -> Result<Found> {
         };
         let map = |kind: &str| folder.join(kind).join(format!("{}.pfm", recorded.file));
         let mask = find_mask(&view, masks);
-        let geometry = MapGeometry::QuarterOf { width, height };
+        let geometry = if record.options.full_resolution {
+            MapGeometry::Whole { width, height }
+        } else {
+            MapGeometry::QuarterOf { width, height }
+        };
         let depth_files =
             DepthFiles { view, geometry, depth: map("depth"), confidence: Some(map("confidence")), mask };
         files.insert(recorded.id, depth_files);
@@ -107,7 +114,8 @@ fn of_result(folder: &Path, masks: Option<&Path>) -> Result<Found> {
             |(rank, view): (usize, &ViewId)| SourceScore { view: *view, score: (count - rank) as f64 };
         ranking.insert(recorded.id, recorded.neighbours.iter().enumerate().map(score).collect());
     }
-    Ok(Found { files, ranking, warnings: Vec::new(), without: Vec::new() })
+    let network_pixel = record.options.filter.network_pixel;
+    Ok(Found { files, ranking, warnings: Vec::new(), without: Vec::new(), network_pixel })
 }
 
 fn of_mvsnet_folder(folder: &Path, masks: Option<&Path>, options: &ReadOptions) -> Result<Found> {
@@ -130,7 +138,7 @@ fn of_mvsnet_folder(folder: &Path, masks: Option<&Path>, options: &ReadOptions) 
     let ranking = rank_sources(&scene, &scene.undistorted_cameras(), &ranges);
     let left_out = scene.skipped.iter().map(|(view, reason)| format!("view {view} is left out: {reason}"));
     let warnings = scene.warnings.iter().map(ToString::to_string).chain(left_out).collect();
-    Ok(Found { files, ranking, warnings, without })
+    Ok(Found { files, ranking, warnings, without, network_pixel: 1.0 })
 }
 
 impl DepthMaps {

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
-use planesweep_plan::{BlobKey, Plan};
-use planesweep_scene::{ReadOptions, Scene, ViewId, decode_image, read_scene};
+use planesweep_plan::{BlobKey, MaskSpec, Plan};
+use planesweep_scene::{ReadOptions, Scene, ViewId, decode_image, find_mask, read_scene};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -70,6 +70,25 @@ pub fn read(path: &Path, options: &ReadOptions) -> Result<Input> {
         bail!("no image of {} can be decoded", path.display());
     }
     Ok(Input { scene, image_hashes, skipped })
+}
+
+/// The masks of the views that have one: in the folder given, or beside the photographs.
+pub fn masks(scene: &Scene, folder: Option<&Path>) -> Result<BTreeMap<ViewId, MaskSpec>> {
+    let folder = folder
+        .map(|folder| folder.canonicalize().with_context(|| format!("cannot find {}", folder.display())))
+        .transpose()?;
+    let found = scene.views.iter().filter_map(|(id, view)| Some((*id, find_mask(view, folder.as_deref())?)));
+    found
+        .map(|(id, path)| {
+            let read = || -> Result<BlobKey> {
+                let bytes = std::fs::read(&path)?;
+                decode_image(&path, &bytes)?;
+                Ok(BlobKey::of(&bytes))
+            };
+            let hash = read().with_context(|| format!("cannot read the mask {}", path.display()))?;
+            Ok((id, MaskSpec { path, hash }))
+        })
+        .collect()
 }
 
 /// All views without a depth map: those left out when reading, and those that the plan skips.

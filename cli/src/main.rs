@@ -17,6 +17,7 @@ mod prepare;
 mod run_record;
 mod supervisor;
 mod training;
+mod workspace;
 
 use std::io::{Write, stdout};
 use std::process::ExitCode;

@@ -51,12 +51,14 @@ pub struct Prepared {
 }
 
 impl Prepared {
-    /// Reads the scene with all its images, and plans.
+    /// Reads the scene with all its images, and plans; `masks` is a folder of masks that lie elsewhere than beside
+    /// the images.
     pub fn new(
         scene: &Path,
         network: Network,
         options: &PlanOptions,
         read: &ReadOptions,
+        masks: Option<&Path>,
         stages: &mut Stages,
     ) -> Result<Self> {
         let input = timed(stages, "read images", || input::read(scene, read))?;
@@ -66,7 +68,8 @@ impl Prepared {
         for skipped in &input.skipped {
             eprintln!("warning: view {} is left out: {}", skipped.view, skipped.reason);
         }
-        let plan = timed(stages, "plan", || Ok(plan(&input.scene, options)))?;
+        let mut plan = timed(stages, "plan", || Ok(plan(&input.scene, options)))?;
+        plan.masks = input::masks(&input.scene, masks)?;
         if plan.views.is_empty() {
             bail!("no view can be reconstructed; `planesweep inspect {}` says why", scene.display());
         }

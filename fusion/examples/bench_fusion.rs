@@ -31,12 +31,18 @@ fn main() {
     let arguments: Vec<String> = std::env::args().collect();
     let option = |name: &str| Some(arguments.get(arguments.iter().position(|a| a == name)? + 1)?.as_str());
     let runs = option("--runs").map_or(15, |runs| runs.parse().expect("--runs N"));
-    for (width, height) in [(288, 216), (1152, 864)] {
+    let wanted = option("--method").map_or_else(
+        || METHODS.to_vec(),
+        |name| {
+            METHODS.into_iter().filter(|method| format!("{method:?}").eq_ignore_ascii_case(name)).collect()
+        },
+    );
+    for (width, height) in [(96, 72), (288, 216), (1152, 864)] {
         let maps: Vec<DepthMap> = (0..=NEIGHBOURS).map(|k| view(k, width, height)).collect();
         println!(
             "{width}x{height}, {NEIGHBOURS} neighbours, median of {runs} runs, with the least and the most"
         );
-        methods(&maps, runs);
+        methods(&maps, &wanted, runs);
         if let Some(python) = option("--twin") {
             against_twin(&maps, python, runs);
         }
@@ -44,15 +50,17 @@ fn main() {
 }
 
 /// All methods, on all processors and on one.
-fn methods(maps: &[DepthMap], runs: usize) {
+fn methods(maps: &[DepthMap], methods: &[FusionMethod], runs: usize) {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a pool of one thread");
-    let mut times = vec![(Vec::new(), Vec::new()); METHODS.len()];
+    let mut times = vec![(Vec::new(), Vec::new(), 0.0); methods.len()];
     let mut emit_ms = Vec::new();
     for _ in 0..runs {
-        for (method, (all, one)) in METHODS.into_iter().zip(&mut times) {
-            let run = || black_box(fuse(maps, method));
+        for (method, (all, one, cpu)) in methods.iter().zip(&mut times) {
+            let run = || black_box(fuse(maps, *method));
             all.push(milliseconds(run));
+            let before = cpu_milliseconds();
             one.push(pool.install(|| milliseconds(run)));
+            *cpu += cpu_milliseconds() - before;
         }
         let filtered = fuse(maps, FusionMethod::Consistency);
         let others = [&filtered; NEIGHBOURS];
@@ -60,9 +68,11 @@ fn methods(maps: &[DepthMap], runs: usize) {
             encode(&emit(&filtered, &emitted(&filtered, &others, 0.01)), VertexFormat::default())
         }));
     }
-    for (method, (all, one)) in METHODS.into_iter().zip(&times) {
-        let funnel = fuse(maps, method).funnel;
-        println!("  {method:?}: {} ms, one thread {} ms, {funnel:?}", spread(all), spread(one));
+    for (method, (all, one, cpu)) in methods.iter().zip(&times) {
+        let funnel = fuse(maps, *method).funnel;
+        let cpu = cpu / runs as f64;
+        println!("  {method:?}: {} ms; one thread {} ms, {cpu:.2} ms of CPU", spread(all), spread(one));
+        println!("    {funnel:?}");
     }
     println!("  emission of points, 10 neighbours asked: {} ms", spread(&emit_ms));
 }
@@ -78,6 +88,16 @@ fn milliseconds<T>(run: impl Fn() -> T) -> f64 {
     begun.elapsed().as_secs_f64() * 1e3
 }
 
+/// CPU time of all threads of this process so far.
+fn cpu_milliseconds() -> f64 {
+    let tasks = fs::read_dir("/proc/self/task").expect("a proc file system");
+    let of = |task: fs::DirEntry| {
+        let text = fs::read_to_string(task.path().join("schedstat")).unwrap_or_default();
+        text.split(' ').next().and_then(|nanoseconds| nanoseconds.parse().ok()).unwrap_or(0.0)
+    };
+    tasks.map(|task| of(task.expect("a thread"))).sum::<f64>() / 1e6
+}
+
 /// Median, least and most.
 fn spread(values: &[f64]) -> String {
     let mut values = values.to_vec();
@@ -91,16 +111,28 @@ fn against_twin(maps: &[DepthMap], python: &str, runs: usize) {
     write_maps(maps, folder.path());
     let mut twin = Twin::start(python, folder.path());
     let (mut ours, mut theirs, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut own_cpu, mut twin_cpu) = (0.0, 0.0);
     for _ in 0..runs {
         // The first of two runs warms the caches that the other program emptied.
         fuse(maps, FusionMethod::Consistency);
+        let before = cpu_milliseconds();
         ours.push(milliseconds(|| fuse(maps, FusionMethod::Consistency)));
+        own_cpu += cpu_milliseconds() - before;
         twin.run();
-        theirs.push(twin.run());
+        let [wall, cpu] = twin.run();
+        theirs.push(wall);
+        twin_cpu += cpu;
         ratios.push(theirs[theirs.len() - 1] / ours[ours.len() - 1]);
     }
     println!("  consistency: ours {} ms, twin {} ms", spread(&ours), spread(&theirs));
-    println!("  ratio: {}", spread(&ratios));
+    let cpu = [own_cpu, twin_cpu].map(|sum| sum / runs as f64);
+    println!(
+        "  ratio: {}; of CPU time {:.1} ({:.2} and {:.2} ms)",
+        spread(&ratios),
+        cpu[1] / cpu[0],
+        cpu[0],
+        cpu[1]
+    );
     twin.finish();
     let fused = fuse(maps, FusionMethod::Consistency);
     let read = |name: &str| fs::read(folder.path().join(name)).expect("the twin's result");
@@ -159,12 +191,13 @@ impl Twin {
         Self { child, orders, answers }
     }
 
-    /// Milliseconds of one run.
-    fn run(&mut self) -> f64 {
+    /// Milliseconds of one run, by the clock and of CPU time.
+    fn run(&mut self) -> [f64; 2] {
         writeln!(self.orders, "run").expect("the twin listens");
         let mut line = String::new();
         self.answers.read_line(&mut line).expect("the twin answers");
-        line.trim().parse::<f64>().expect("seconds") * 1e3
+        let mut seconds = line.split_whitespace().map(|text| text.parse::<f64>().expect("seconds") * 1e3);
+        [seconds.next().expect("wall time"), seconds.next().expect("CPU time")]
     }
 
     /// Lets it write its result.

@@ -1,9 +1,7 @@
 //! Dynamic consistency: the more views agree, the less closely each must (D2HC-RMVSNet, Yan et al.
 //! 2020, section 3.3).
 
-#![allow(clippy::inline_always)] // compiled once per instruction set, with the row's other work
-
-use crate::geometric::Agreement;
+use crate::kernel::{Answer, LANES, Lanes};
 
 /// Pixels of reprojection error that each further neighbour allows, inverted.
 const LEVELS_PER_PIXEL: f32 = 4.0;
@@ -12,59 +10,70 @@ const LEVELS_PER_DEPTH: f32 = 1300.0;
 
 /// The least n for which a reprojection error (given squared) is less than n/4 pixels and a relative
 /// difference of depth less than n/1300; infinite where one of them is no number.
+///
+/// # Safety
+/// As [`Lanes`].
 #[inline(always)]
-pub(crate) fn level(squared_px: f32, relative_depth: f32) -> f32 {
-    let level = (LEVELS_PER_PIXEL * squared_px.sqrt()).max(LEVELS_PER_DEPTH * relative_depth).floor() + 1.0;
-    // `max` passes over what is no number.
-    if (squared_px + relative_depth).is_nan() { f32::INFINITY } else { level }
+#[expect(clippy::inline_always, reason = "compiled once per instruction set")]
+#[expect(unsafe_code, reason = "part of the kernel")]
+pub(crate) unsafe fn level<L: Lanes>(squared_px: L::F, relative_depth: L::F) -> L::F {
+    // SAFETY: the caller vouches for the processor.
+    unsafe {
+        let by_pixels = L::mul(L::splat(LEVELS_PER_PIXEL), L::sqrt(squared_px));
+        let by_depth = L::mul(L::splat(LEVELS_PER_DEPTH), relative_depth);
+        let larger = L::select(L::less(by_pixels, by_depth), by_depth, by_pixels);
+        let level = L::add(L::floor(larger), L::splat(1.0));
+        let are_numbers = L::less(L::splat(-1.0), L::add(squared_px, relative_depth));
+        L::select(are_numbers, level, L::splat(f32::INFINITY))
+    }
 }
 
 /// Keeps, for each hypothesis, the neighbours that meet the strictest thresholds that enough of them
 /// meet: those of level n or less, for the least n of at least `min_neighbours` that n of them meet.
 /// Keeps none where there is no such n.
-#[derive(Default)]
-pub(crate) struct Settlement {
-    /// How many neighbours have each level.
-    having: Vec<u32>,
+pub(crate) fn settle(answers: &mut [Answer], having: &mut Vec<u32>, min_neighbours: u32) {
+    let most = answers.len();
+    for k in 0..LANES {
+        having.clear();
+        having.resize(most + 1, 0);
+        for answer in answers.iter().filter(|answer| answer.depth[k] > 0.0) {
+            // Levels beyond `most`, which nothing can decide for, have no place.
+            if let Some(having) = having.get_mut(answer.level[k] as usize) {
+                *having += 1;
+            }
+        }
+        let decided = decided(having, min_neighbours.max(1) as usize);
+        for answer in answers.iter_mut() {
+            let met = decided.is_some_and(|n| answer.level[k] <= n as f32);
+            answer.depth[k] = if met { answer.depth[k] } else { 0.0 };
+        }
+    }
 }
 
-impl Settlement {
-    #[inline(always)]
-    pub fn settle(&mut self, agreements: &mut [Agreement], hypotheses: usize, min_neighbours: u32) {
-        let most = agreements.len();
-        for i in 0..hypotheses {
-            self.having.clear();
-            self.having.resize(most + 1, 0);
-            for agreement in agreements.iter().filter(|agreement| agreement.depth[i] > 0.0) {
-                // Levels beyond `most`, which nothing can decide for, have no place.
-                if let Some(having) = self.having.get_mut(agreement.level[i] as usize) {
-                    *having += 1;
-                }
-            }
-            let decided = self.decided(min_neighbours.max(1) as usize);
-            for agreement in agreements.iter_mut() {
-                let met = decided.is_some_and(|n| agreement.level[i] <= n as f32);
-                agreement.depth[i] = if met { agreement.depth[i] } else { 0.0 };
-            }
+/// The least n from `least` on that as many neighbours have at most as their level, where `having[n]` have it.
+fn decided(having: &[u32], least: usize) -> Option<usize> {
+    let mut meeting = 0;
+    for (n, having) in having.iter().enumerate() {
+        meeting += having;
+        if n >= least && meeting as usize >= n {
+            return Some(n);
         }
     }
-
-    /// The least n from `least` on that as many neighbours have at most as their level.
-    fn decided(&self, least: usize) -> Option<usize> {
-        let mut meeting = 0;
-        for (n, having) in self.having.iter().enumerate() {
-            meeting += having;
-            if n >= least && meeting as usize >= n {
-                return Some(n);
-            }
-        }
-        None
-    }
+    None
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kernel::Portable;
+
+    fn level(squared_px: f32, relative_depth: f32) -> f32 {
+        // SAFETY: the portable lanes need nothing.
+        #[expect(unsafe_code, reason = "part of the kernel")]
+        unsafe {
+            super::level::<Portable>([squared_px; LANES], [relative_depth; LANES])[0]
+        }
+    }
 
     #[test]
     fn a_level_is_the_least_that_meets_both_thresholds() {
@@ -78,14 +87,16 @@ mod tests {
 
     /// What is left of five neighbours of these levels; 0 stands for one that sees nothing there.
     fn settled(levels: [f32; 5], min_neighbours: u32) -> [bool; 5] {
-        let agreement = |level: f32| Agreement {
-            depth: vec![if level > 0.0 { 2.0 } else { 0.0 }],
-            level: vec![level],
-            ..Agreement::default()
+        // The last lane stands for all, so that none is forgotten.
+        let lanes = |value: f32| std::array::from_fn(|k| if k + 1 == LANES { value } else { 0.0 });
+        let answer = |level: f32| Answer {
+            depth: lanes(if level > 0.0 { 2.0 } else { 0.0 }),
+            level: lanes(level),
+            ..Answer::default()
         };
-        let mut agreements = levels.map(agreement);
-        Settlement::default().settle(&mut agreements, 1, min_neighbours);
-        agreements.map(|agreement| agreement.depth[0] > 0.0)
+        let mut answers = levels.map(answer);
+        settle(&mut answers, &mut Vec::new(), min_neighbours);
+        answers.map(|answer| answer.depth[LANES - 1] > 0.0)
     }
 
     #[test]

@@ -1,7 +1,8 @@
 //! Point clouds as LAS and LAZ files.
 
 use std::fs::File;
-use std::io::{self, BufWriter};
+use std::io::{self, BufWriter, Seek, Write};
+use std::mem;
 use std::path::{Path, PathBuf};
 
 use las::point::Format;
@@ -54,7 +55,7 @@ pub enum LasError {
 pub struct LasWriter {
     output: Output,
     resolution: f64,
-    writer: Option<las::Writer<BufWriter<File>>>,
+    writer: Points,
 }
 
 impl LasWriter {
@@ -64,7 +65,7 @@ impl LasWriter {
         let output =
             Output::create(path).map_err(|source| LasError::Output { path: path.to_owned(), source })?;
         let resolution = if resolution > 0.0 && resolution.is_finite() { resolution } else { 1e-3 };
-        Ok(Self { output, resolution, writer: None })
+        Ok(Self { output, resolution, writer: Points(None) })
     }
 
     /// Appends points.
@@ -72,19 +73,19 @@ impl LasWriter {
         let Some(first) = points.first() else { return Ok(()) };
         let path = self.output.path().to_owned();
         let error = |source| LasError::Points { path: path.clone(), source };
-        if self.writer.is_none() {
+        if self.writer.0.is_none() {
             let file =
                 self.output.reopen().map_err(|source| LasError::Output { path: path.clone(), source })?;
             let header = self.header(first).and_then(Builder::into_header).map_err(error)?;
             let writer = las::Writer::new(BufWriter::with_capacity(1 << 20, file), header).map_err(error)?;
-            self.writer = Some(writer);
+            self.writer.0 = Some(writer);
         }
-        let Some(writer) = &mut self.writer else { return Ok(()) };
+        let Some(writer) = &mut self.writer.0 else { return Ok(()) };
         let transforms = *writer.header().transforms();
         for point in points {
             let [x, y, z] = point.position;
             let axes = [(x, transforms.x), (y, transforms.y), (z, transforms.z)];
-            // Beyond them the writer's header makes no sense, and it panics when it is dropped.
+            // Beyond them the file's header makes no sense.
             if axes.iter().any(|(value, axis)| axis.inverse(*value).is_err()) {
                 return Err(LasError::TooFar { path, position: point.position });
             }
@@ -119,11 +120,32 @@ impl LasWriter {
     /// Gives the file its name.
     pub fn finish(mut self) -> Result<(), LasError> {
         let path = self.output.path().to_owned();
-        if let Some(mut writer) = self.writer.take() {
-            writer.close().map_err(|source| LasError::Points { path: path.clone(), source })?;
+        if let Some(writer) = self.writer.0.take() {
+            end(writer).map_err(|source| LasError::Points { path: path.clone(), source })?;
         }
         self.output.finish(&[]).map_err(|source| LasError::Output { path, source })
     }
+}
+
+/// A writer of points, once there is a first one.
+struct Points(Option<las::Writer<BufWriter<File>>>);
+
+impl Drop for Points {
+    fn drop(&mut self) {
+        // Whoever drops it has an error of his own to tell.
+        self.0.take().map(end).transpose().ok();
+    }
+}
+
+/// Completes the file. A writer that cannot, on a full disk for one, is leaked, for it would panic if it were
+/// dropped.
+fn end<W: Write + Seek + Send + Sync + 'static>(mut writer: las::Writer<W>) -> Result<(), las::Error> {
+    if let Err(error) = writer.close() {
+        mem::forget(writer);
+        return Err(error);
+    }
+    writer.into_inner()?.flush()?;
+    Ok(())
 }
 
 #[cfg(test)]
@@ -178,5 +200,24 @@ mod tests {
         assert!(matches!(error, LasError::TooFar { .. }));
         drop(writer);
         assert_eq!(std::fs::read_dir(folder.path()).expect("listed").count(), 0);
+    }
+
+    #[test]
+    fn a_full_disk_is_an_error_and_no_panic() {
+        let Ok(full) = File::options().write(true).open("/dev/full") else {
+            eprintln!("SKIPPED a_full_disk_is_an_error_and_no_panic: there is no /dev/full");
+            return;
+        };
+        for compressed in [false, true] {
+            let mut builder = Builder::from((1, 2));
+            builder.point_format.is_compressed = compressed;
+            // All stays in the buffer, so that the end is the first to fail.
+            let file = BufWriter::with_capacity(1 << 20, full.try_clone().expect("cloned"));
+            let header = builder.into_header().expect("a header");
+            let mut writer = las::Writer::new(file, header).expect("begun");
+            writer.write_point(las::Point::default()).expect("buffered");
+            let error = end(writer).expect_err("the disk is full");
+            assert!(error.to_string().contains("No space left"), "{error}");
+        }
     }
 }

@@ -20,13 +20,13 @@
 #[cfg(test)]
 mod analytic;
 mod cloud;
-mod color;
 mod dynamic;
 mod filter;
 mod filtered_bytes;
 mod funnel;
 mod geometric;
 mod hypotheses;
+mod kernel;
 mod las;
 mod normals;
 mod options;

@@ -10,7 +10,7 @@ pub struct FilterOptions {
     pub method: FusionMethod,
     /// Pixels with less confidence are dropped.
     pub min_confidence: f32,
-    /// Largest distance between a pixel and its reprojection, exclusive, in pixels of the depth map.
+    /// Largest distance between a pixel and its reprojection, exclusive, in pixels of the network's depth map.
     pub max_reprojection_px: f32,
     /// Largest relative difference of the reprojected depth, exclusive.
     pub max_relative_depth: f32,
@@ -20,6 +20,14 @@ pub struct FilterOptions {
     /// How a neighbour's depth is read between its pixels.
     #[serde(default)]
     pub sampling: DepthSampling,
+    /// Width of a pixel of the network's depth map in pixels of the maps at hand, which are wider where they were
+    /// upsampled: thresholds in pixels are in those of the network.
+    #[serde(default = "one")]
+    pub network_pixel: f32,
+}
+
+fn one() -> f32 {
+    1.0
 }
 
 impl Default for FilterOptions {
@@ -31,6 +39,7 @@ impl Default for FilterOptions {
             max_relative_depth: 0.01,
             min_views: 3,
             sampling: DepthSampling::default(),
+            network_pixel: one(),
         }
     }
 }

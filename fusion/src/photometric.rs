@@ -12,15 +12,14 @@ pub(crate) fn confident_depths(
     min_confidence: f32,
     row: &mut HypothesisRow,
 ) -> usize {
-    row.clear();
+    row.clear(map.width());
     let mut with_depth = 0;
     for (x, (&depth, &confidence)) in map.depth.row(y).iter().zip(map.confidence.row(y)).enumerate() {
         let has_depth = depth > 0.0;
         with_depth += usize::from(has_depth);
-        if has_depth && confidence >= min_confidence {
-            row.push(x, depth, depth);
-        }
+        row.push_if(has_depth & (confidence >= min_confidence), x, depth, depth);
     }
+    row.end();
     with_depth
 }
 
@@ -45,6 +44,8 @@ mod tests {
         let mut row = HypothesisRow::default();
         confident_depths(&map, 0, 0.8, &mut row);
         assert_eq!(confident_depths(&map, 1, 0.8, &mut row), 3);
-        assert_eq!((row.columns, row.depths, row.own), (vec![0.0, 3.0], vec![1.0, 4.0], vec![1.0, 4.0]));
+        assert_eq!(row.iter().collect::<Vec<_>>(), [(0, 1.0, 1.0), (3, 4.0, 4.0)]);
+        assert_eq!((row.blocks(), row.block(0).count), (1, 2));
+        assert_eq!(row.block(0).depths[..3], [1.0, 4.0, 0.0]);
     }
 }

@@ -9,42 +9,41 @@
 //! the chain of views that defer to each other, and whatever the filters did to the best view. Where
 //! the best view's own pixel was dropped, the others emit theirs.
 
-#![allow(clippy::inline_always)] // a row's work is compiled once per instruction set
-
 use nalgebra::{Point2, Point3};
 use planesweep_scene::{Camera, Raster};
 use rayon::prelude::*;
 
 use crate::filter::FilteredMap;
 
-/// Footprints that differ by less than this are equal, so that both views see them so.
-const EQUAL_FOOTPRINTS: f32 = 1e-4;
+/// Relative difference below which footprints are equal, so that both views see them so.
+pub(crate) const EQUAL_FOOTPRINTS: f32 = 1e-4;
 
-/// How a view competes with others for a place.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Claim {
+/// How a neighbour competes with the reference for a place: the smaller footprint wins, width of a pixel times
+/// depth; of equal ones the first by the coordinates of the camera centres, which stay the same when views are
+/// numbered anew. Of two views in different places one wins.
+pub(crate) struct Rival {
     /// Width of a pixel at depth 1.
-    pixel_width: f32,
-    /// Breaks ties, by coordinates: it stays the same when views are numbered anew.
-    centre: Point3<f64>,
+    pub pixel_width: f32,
+    /// Of the reference.
+    pub reference_pixel_width: f32,
+    /// Whether it wins where footprints are equal.
+    pub wins_ties: bool,
 }
 
-impl Claim {
-    pub fn of(camera: &Camera) -> Self {
-        let k = &camera.intrinsics;
-        Self { pixel_width: (1.0 / (k.fx * k.fy).sqrt()) as f32, centre: camera.pose.centre() }
-    }
-
-    /// Whether this view's claim to a place at `depth` (in its own frame) is better than `other`'s,
-    /// who sees it at `other_depth`. Of two claims of views in different places one is better.
-    #[inline(always)]
-    pub fn beats(&self, depth: f32, other: &Self, other_depth: f32) -> bool {
-        let (footprint, others) = (depth * self.pixel_width, other_depth * other.pixel_width);
-        if (footprint - others).abs() < EQUAL_FOOTPRINTS * others {
-            let (a, b) = (&self.centre.coords, &other.centre.coords);
-            (a.x, a.y, a.z) < (b.x, b.y, b.z)
-        } else {
-            footprint < others
+impl Rival {
+    pub fn new(neighbour: &Camera, reference: &Camera) -> Self {
+        let pixel_width = |camera: &Camera| {
+            let k = &camera.intrinsics;
+            (1.0 / (k.fx * k.fy).sqrt()) as f32
+        };
+        let centre = |camera: &Camera| {
+            let centre = camera.pose.centre();
+            (centre.x, centre.y, centre.z)
+        };
+        Self {
+            pixel_width: pixel_width(neighbour),
+            reference_pixel_width: pixel_width(reference),
+            wins_ties: centre(neighbour) < centre(reference),
         }
     }
 }

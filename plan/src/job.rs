@@ -10,7 +10,7 @@ use crate::{BlobKey, JobId};
 
 /// Raised whenever a change of the code changes the numbers of a result, so that results of older
 /// code are not taken for those of newer code.
-pub const NUMERICS_VERSION: u32 = 2;
+pub const NUMERICS_VERSION: u32 = 3;
 
 /// One unit of work.
 #[derive(Clone, Debug, PartialEq)]
@@ -31,6 +31,8 @@ pub enum JobSpec {
     Infer(InferSpec),
     /// Puts the bands of a view's depth map together.
     Stitch(StitchSpec),
+    /// Makes of the network's depth map what fusion takes: masked, at the photograph's resolution.
+    Fit(FitSpec),
     /// Checks the depth map of a view against those of its neighbours and merges agreeing depths.
     Filter(FilterSpec),
     /// Turns the filtered depth map of a view into points, less what a neighbour emits.
@@ -61,6 +63,26 @@ pub struct StitchSpec {
     pub view: ViewId,
 }
 
+/// The depth map of a view, changed for fusion. Needs the `Infer` or `Stitch` job that gives it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FitSpec {
+    /// The photograph.
+    pub image: ImageSpec,
+    /// What is left out.
+    pub mask: Option<MaskSpec>,
+    /// Whether the map is upsampled to the resolution of the working image.
+    pub full_resolution: bool,
+}
+
+/// An image that is black where the depth map of a view is to have none.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MaskSpec {
+    /// Where the file lies, on hosts that can read it.
+    pub path: PathBuf,
+    /// BLAKE3 hash of the file's bytes.
+    pub hash: BlobKey,
+}
+
 /// An image as the network wants it: undistorted, then resized to the working size.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImageSpec {
@@ -82,8 +104,8 @@ pub struct ImageSpec {
     pub working_height: u32,
 }
 
-/// Filtering of one view. Needs the jobs that give the depth maps (`Infer`, or `Stitch` where there
-/// are bands) of the view, first, and of its neighbours, in order.
+/// Filtering of one view. Needs the jobs that give the depth maps (`Infer`, `Stitch` where there are bands, or `Fit`)
+/// of the view, first, and of its neighbours, in order.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FilterSpec {
     /// The reference view.
@@ -115,11 +137,12 @@ pub struct AssembleSpec {
 }
 
 impl JobSpec {
-    /// The name of the kind: "infer", "stitch", "filter", "emit" or "assemble".
+    /// The name of the kind: "infer", "stitch", "fit", "filter", "emit" or "assemble".
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Infer(_) => "infer",
             Self::Stitch(_) => "stitch",
+            Self::Fit(_) => "fit",
             Self::Filter(_) => "filter",
             Self::Emit(_) => "emit",
             Self::Assemble(_) => "assemble",
@@ -131,6 +154,7 @@ impl JobSpec {
         match self {
             Self::Infer(spec) => Some(spec.reference.view),
             Self::Stitch(spec) => Some(spec.view),
+            Self::Fit(spec) => Some(spec.image.view),
             Self::Filter(spec) => Some(spec.view),
             Self::Emit(spec) => Some(spec.view),
             Self::Assemble(_) => None,

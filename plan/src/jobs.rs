@@ -7,7 +7,8 @@ use planesweep_scene::{Camera, DepthHypotheses, Sampling, Scene, ViewId};
 use thiserror::Error;
 
 use crate::job::{
-    AssembleSpec, EmitSpec, FilterSpec, ImageSpec, InferSpec, Job, JobSpec, NUMERICS_VERSION, StitchSpec,
+    AssembleSpec, EmitSpec, FilterSpec, FitSpec, ImageSpec, InferSpec, Job, JobSpec, NUMERICS_VERSION,
+    StitchSpec,
 };
 use crate::size::working_size;
 use crate::{BlobKey, JobId, Plan};
@@ -24,7 +25,7 @@ pub enum JobsError {
 }
 
 /// The jobs of a plan, every job after the jobs it needs: all `Infer` jobs in the order of the plan,
-/// then all `Stitch`, all `Filter`, all `Emit`, and `Assemble`.
+/// then all `Stitch`, all `Fit`, all `Filter`, all `Emit`, and `Assemble`.
 ///
 /// `image_hashes` are the hashes of the image files' bytes; `weights` is the key of the weights.
 pub fn jobs(
@@ -54,6 +55,7 @@ pub fn jobs(
     };
     let mut infer = Vec::with_capacity(plan.views.len());
     let mut stitch = Vec::new();
+    let mut fit = Vec::new();
     // Who gives the depth map of each view.
     let mut maps = BTreeMap::new();
     for view in &plan.views {
@@ -77,6 +79,16 @@ pub fn jobs(
         maps.insert(view.view, whole.id);
         infer.extend(bands);
         stitch.push(whole);
+    }
+    let full_resolution = plan.options.full_resolution;
+    for view in plan.views.iter().map(|view| view.view) {
+        let mask = plan.masks.get(&view).cloned();
+        if mask.is_some() || full_resolution {
+            let spec = FitSpec { image: image(view)?, mask, full_resolution };
+            let fitted = job(JobSpec::Fit(spec), vec![maps[&view]]);
+            maps.insert(view, fitted.id);
+            fit.push(fitted);
+        }
     }
     let by_neighbourhood = |ids: &BTreeMap<ViewId, JobId>,
                             with_neighbours: bool,
@@ -109,7 +121,7 @@ pub fn jobs(
     emitted.sort_unstable();
     let (views, needs) = emitted.into_iter().unzip();
     let assemble = job(JobSpec::Assemble(AssembleSpec { views }), needs);
-    Ok(infer.into_iter().chain(stitch).chain(filter).chain(emit).chain([assemble]).collect())
+    Ok(infer.into_iter().chain(stitch).chain(fit).chain(filter).chain(emit).chain([assemble]).collect())
 }
 
 /// Names a job by the hash of its specification, of the jobs it needs and of the code's numerics.
@@ -131,6 +143,11 @@ fn job(spec: JobSpec, needs: Vec<JobId>) -> Job {
                 digest.u32(row);
             }
         }
+        JobSpec::Fit(fit) => {
+            digest.image(&fit.image);
+            digest.u32(u32::from(fit.full_resolution));
+            digest.bytes(fit.mask.as_ref().map_or(&[], |mask| &mask.hash.0));
+        }
         JobSpec::Filter(filter) => {
             let options = filter.options;
             digest.u32(match options.method {
@@ -143,6 +160,7 @@ fn job(spec: JobSpec, needs: Vec<JobId>) -> Job {
             digest.f64(options.max_reprojection_px as f64);
             digest.f64(options.max_relative_depth as f64);
             digest.u32(options.min_views);
+            digest.f64(options.network_pixel as f64);
             digest.u32(match options.sampling {
                 DepthSampling::Bilinear => 0,
                 DepthSampling::Continuous => 1,
@@ -219,7 +237,7 @@ mod tests {
     use planesweep_scene::{DepthRange, Distortion, Intrinsics, Pose, View};
 
     use super::*;
-    use crate::{PlanOptions, plan};
+    use crate::{MaskSpec, PlanOptions, plan};
 
     fn scene() -> Scene {
         let intrinsics =
@@ -298,6 +316,30 @@ mod tests {
         let mut bent = scene();
         bent.views.get_mut(&ViewId(0)).expect("exists").distortion = Distortion::Radial { k1: 0.1, k2: 0.0 };
         assert!(ids(&plain).is_disjoint(&ids(&jobs_of(&bent, &PlanOptions::default(), b"w"))));
+    }
+
+    #[test]
+    fn masks_and_full_resolution_change_what_is_filtered_and_not_what_is_inferred() {
+        let plain = jobs_of(&scene(), &PlanOptions::default(), b"w");
+        let hashes = scene().views.values().map(|v| (v.id, BlobKey::of(v.name.as_bytes()))).collect();
+        let masked = |bytes: &[u8]| {
+            let mut plan = plan(&scene(), &PlanOptions::default());
+            let mask = MaskSpec { path: "1.png".into(), hash: BlobKey::of(bytes) };
+            plan.masks.insert(ViewId(1), mask);
+            jobs(&scene(), &plan, &hashes, BlobKey::of(b"w")).expect("all views are known")
+        };
+        let one = masked(b"m");
+        assert_eq!(
+            (one[4].spec.kind(), one[4].spec.view(), &one[4].needs),
+            ("fit", Some(ViewId(1)), &vec![one[1].id])
+        );
+        assert_eq!(ids(&plain).intersection(&ids(&one)).count(), 4, "inference stays");
+        assert_eq!(ids(&masked(b"other")).intersection(&ids(&one)).count(), 4);
+        let options = PlanOptions { full_resolution: true, ..PlanOptions::default() };
+        let full = jobs_of(&scene(), &options, b"w");
+        assert_eq!(full.iter().filter(|job| job.spec.kind() == "fit").count(), 4);
+        assert!(full[8].needs.iter().all(|need| full[4..8].iter().any(|fit| fit.id == *need)));
+        assert_eq!(ids(&plain).intersection(&ids(&full)).count(), 4);
     }
 
     #[test]

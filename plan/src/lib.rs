@@ -25,7 +25,8 @@ pub use checkup::{Finding, Severity, checkup, sparse_depths};
 pub use depth_range::{DEPTH_MULTIPLE, MIN_POINTS};
 pub use ids::{Attempt, BlobKey, JobId, ParseHashError, RunId, WorkerId};
 pub use job::{
-    AssembleSpec, EmitSpec, FilterSpec, ImageSpec, InferSpec, Job, JobSpec, NUMERICS_VERSION, StitchSpec,
+    AssembleSpec, EmitSpec, FilterSpec, FitSpec, ImageSpec, InferSpec, Job, JobSpec, MaskSpec,
+    NUMERICS_VERSION, StitchSpec,
 };
 pub use jobs::{JobsError, jobs};
 pub use options::{MAX_DEPTHS, MIN_DEPTHS, PlanOptions, SamplingChoice};

@@ -47,6 +47,9 @@ pub struct PlanOptions {
     /// Whether a surface that several views see is emitted by one of them only.
     #[serde(default)]
     pub once_per_surface: bool,
+    /// Whether depth maps are upsampled to the resolution of the working images before they are fused.
+    #[serde(default)]
+    pub full_resolution: bool,
 }
 
 impl Default for PlanOptions {
@@ -61,6 +64,7 @@ impl Default for PlanOptions {
             band_rows: None,
             filter: FilterOptions::default(),
             once_per_surface: true,
+            full_resolution: false,
         }
     }
 }

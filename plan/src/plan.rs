@@ -13,6 +13,7 @@ use serde::Serialize;
 use crate::bands::bands;
 use crate::depth_range::{choose_sampling, hypotheses, robust_range};
 use crate::focus::focus_ranges;
+use crate::job::MaskSpec;
 use crate::options::PlanOptions;
 use crate::order::{order_views, symmetric_neighbours};
 use crate::size::working_size;
@@ -27,6 +28,9 @@ pub struct Plan {
     pub views: Vec<ViewPlan>,
     /// The views that get no depth map, with the reason, by id.
     pub skipped: BTreeMap<ViewId, SkipReason>,
+    /// What is left out of the depth maps of views; empty until whoever reads the disk fills it.
+    #[serde(skip)]
+    pub masks: BTreeMap<ViewId, MaskSpec>,
 }
 
 /// What is to be done for one view.
@@ -146,7 +150,7 @@ pub fn plan(scene: &Scene, options: &PlanOptions) -> Plan {
         view.neighbours = neighbours.remove(&view.view).unwrap_or_default();
         view.neighbours.retain(|neighbour| !skipped.contains_key(neighbour));
     }
-    Plan { options: options.clone(), views, skipped }
+    Plan { options: options.clone(), views, skipped, masks: BTreeMap::new() }
 }
 
 /// The camera of a view's image at working size.

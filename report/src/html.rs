@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use crate::depth_histogram::plot_depth_histogram;
 use crate::picture::{PictureError, encode_jpeg, shrunk};
-use crate::{Funnel, RunReport, ViewReport};
+use crate::{Funnel, Loss, RunReport, ViewReport};
 
 /// The pictures of a report. They are embedded as JPEG, reduced where they are wider than the page
 /// can show, so that a report of hundreds of views still opens.
@@ -53,6 +53,7 @@ pub fn render_html(report: &RunReport, pictures: &Pictures) -> Result<String, Pi
     let stages =
         report.stages.iter().map(|s| (s.name.as_str(), share(s.seconds, longest), duration(s.seconds)));
     push(&mut page, format_args!("{}</div>\n</div>\n</div>\n", bars(stages)));
+    push_losses(&mut page, &report.funnel());
 
     push_skipped(&mut page, report);
     push(&mut page, format_args!("<h2>Views</h2>\n"));
@@ -129,6 +130,26 @@ fn push_view(page: &mut String, view: &ViewReport, pictures: &Pictures) -> Resul
         ),
     );
     Ok(())
+}
+
+/// What each step dropped, why, and what to do; the largest loss stands out.
+fn push_losses(page: &mut String, funnel: &Funnel) {
+    push(page, format_args!("<h2>What was dropped</h2>\n<div class=\"card\"><table>\n"));
+    for Loss { step, pixels, is_largest, reason, advice } in funnel.losses() {
+        let share = 100.0 * share(pixels as f64, funnel.pixels as f64);
+        let step = if is_largest { format!("{step} (the largest loss)") } else { step.to_owned() };
+        push(
+            page,
+            format_args!(
+                "<tr><th>{}</th><td>{} pixels, {share:.1} %: {}.<br><span class=\"soft\">{}.</span></td></tr>\n",
+                escape(&step),
+                grouped(pixels),
+                escape(reason),
+                escape(advice),
+            ),
+        );
+    }
+    push(page, format_args!("</table></div>\n"));
 }
 
 fn push_warnings(page: &mut String, warnings: &[String]) {

@@ -41,6 +41,13 @@ pub enum MapGeometry {
     /// padded rows and columns, pixel u of the map is centred on that multiple of u, as strided
     /// convolutions make it; otherwise it is a photograph resized.
     BySize,
+    /// The working image of this size.
+    Whole {
+        /// Columns of the working image.
+        width: u32,
+        /// Rows of the working image.
+        height: u32,
+    },
     /// A quarter of the working image of this size.
     QuarterOf {
         /// Columns of the working image.
@@ -124,19 +131,28 @@ impl DepthFiles {
     ///
     /// The depth of what the mask leaves out is 0. Colours are those of the photograph, undistorted.
     pub fn read(&self) -> Result<DepthMap, DepthFilesError> {
+        self.read_with_photograph().map(|(map, _)| map)
+    }
+
+    /// Reads the map at the resolution of the photograph; see [`DepthMap::upsampled`].
+    pub fn read_upsampled(&self) -> Result<DepthMap, DepthFilesError> {
+        self.read_with_photograph().map(|(map, photograph)| map.upsampled(&photograph))
+    }
+
+    /// Reads the map, and the photograph as its pixels lie in it: undistorted, and of the working size where that is
+    /// known; of the map's size where the map is a photograph resized.
+    pub fn read_with_photograph(&self) -> Result<(DepthMap, WorkingImage), DepthFilesError> {
         let name = || self.view.name.clone();
-        let mut depth = read_depth_pfm(&self.depth)?;
+        let depth = read_depth_pfm(&self.depth)?;
         let (width, height) = (depth.width() as u32, depth.height() as u32);
         let confidence = match &self.confidence {
             Some(path) => read_pfm(path)?,
             None => Raster::filled(depth.width(), depth.height(), 1.0),
         };
-        if let Some(path) = &self.mask {
-            leave_out(&mut depth, &read_image(path)?);
-        }
         let pixels = read_image(&self.view.image)?;
         let size = undistorted_intrinsics(&self.view.camera.intrinsics, &self.view.distortion);
         let (working, step) = match self.geometry {
+            MapGeometry::Whole { width, height } => ((width, height), Some(1)),
             MapGeometry::QuarterOf { width, height } => ((width, height), Some(4)),
             MapGeometry::BySize => match step(&size, width, height) {
                 Some(step) => ((size.width, size.height), Some(step)),
@@ -146,7 +162,7 @@ impl DepthFiles {
         let image =
             WorkingImage::prepare(pixels, &self.view.camera, &self.view.distortion, working.0, working.1)
                 .map_err(|source| DepthFilesError::Prepare { view: name(), source })?;
-        let k = &image.camera.intrinsics;
+        let k = image.camera.intrinsics;
         let (intrinsics, color) = match step {
             Some(4) => (k.quartered(), image.map_colors(depth.width(), depth.height())),
             Some(step) => {
@@ -157,7 +173,7 @@ impl DepthFiles {
                     skew: k.skew / s,
                     cx: k.cx / s,
                     cy: k.cy / s,
-                    ..*k
+                    ..k
                 };
                 let step = step as usize;
                 let (right, bottom) = (image.pixels.width() - 1, image.pixels.height() - 1);
@@ -165,11 +181,15 @@ impl DepthFiles {
                     |x: usize, y: usize| image.pixels.at((step * x).min(right), (step * y).min(bottom));
                 (k, Raster::from_fn(depth.width(), depth.height(), color))
             }
-            None => (*k, image.pixels),
+            None => (k, image.pixels.clone()),
         };
         let camera = Camera { intrinsics: intrinsics.with_size(width, height), pose: self.view.camera.pose };
-        DepthMap::new(camera, depth, confidence, color)
-            .map_err(|source| DepthFilesError::DepthMap { view: name(), source })
+        let mut map = DepthMap::new(camera, depth, confidence, color)
+            .map_err(|source| DepthFilesError::DepthMap { view: name(), source })?;
+        if let Some(path) = &self.mask {
+            map.leave_out(&read_image(path)?);
+        }
+        Ok((map, image))
     }
 
     /// What tells whether the files have changed: their sizes and times of change.
@@ -187,18 +207,6 @@ impl DepthFiles {
 fn step(image: &Intrinsics, width: u32, height: u32) -> Option<u32> {
     let fits = |image: u32, map: u32, step: u32| (step * map).abs_diff(image) < CROP;
     [1, 2, 4].into_iter().find(|s| fits(image.width, width, *s) && fits(image.height, height, *s))
-}
-
-/// Takes away the depth where the mask, stretched over the map, is black.
-fn leave_out(depth: &mut Raster<f32>, mask: &Raster<[u8; 3]>) {
-    let (width, height) = (depth.width(), depth.height());
-    for (index, value) in depth.values_mut().iter_mut().enumerate() {
-        let (x, y) = (index % width, index / width);
-        let at = |pixel: usize, size: usize, of: usize| ((2 * pixel + 1) * of / (2 * size)).min(of - 1);
-        if mask.at(at(x, width, mask.width()), at(y, height, mask.height())) == [0; 3] {
-            *value = 0.0;
-        }
-    }
 }
 
 #[cfg(test)]

@@ -66,6 +66,18 @@ impl DepthMap {
         Ok(Self { camera, depth, confidence, color })
     }
 
+    /// Takes away the depth where a mask, stretched over the map, is black.
+    pub fn leave_out(&mut self, mask: &Raster<[u8; 3]>) {
+        let (width, height) = (self.width(), self.height());
+        for (index, depth) in self.depth.values_mut().iter_mut().enumerate() {
+            let (x, y) = (index % width, index / width);
+            let at = |pixel: usize, size: usize, of: usize| ((2 * pixel + 1) * of / (2 * size)).min(of - 1);
+            if mask.at(at(x, width, mask.width()), at(y, height, mask.height())) == [0; 3] {
+                *depth = 0.0;
+            }
+        }
+    }
+
     /// Columns.
     pub fn width(&self) -> usize {
         self.depth.width()

@@ -30,6 +30,7 @@ mod scene;
 mod stitch;
 mod training_sample;
 mod undistort;
+mod upsample;
 mod working_image;
 mod write;
 
@@ -53,5 +54,5 @@ pub use undistort::undistorted_intrinsics;
 pub use working_image::{PrepareError, WorkingImage};
 pub use write::{
     Held, TargetFormat, WriteError, held, mvsnet_cam_text, mvsnet_pair_text, write_atomically, write_colmap,
-    write_colmap_text, write_mvsnet, write_openmvg, write_scene,
+    write_colmap_array, write_colmap_text, write_colmap_workspace, write_mvsnet, write_openmvg, write_scene,
 };

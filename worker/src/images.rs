@@ -1,11 +1,11 @@
 //! Working images, decoded once for all the jobs that need them.
 
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use planesweep_plan::{BlobKey, ImageSpec};
-use planesweep_scene::{ImageError, PrepareError, WorkingImage, decode_image};
+use planesweep_plan::{BlobKey, ImageSpec, MaskSpec};
+use planesweep_scene::{ImageError, PrepareError, Raster, WorkingImage, decode_image};
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 use thiserror::Error;
@@ -96,12 +96,21 @@ impl Images {
     }
 }
 
+/// The mask of a specification.
+pub(crate) fn load_mask(spec: &MaskSpec) -> Result<Raster<[u8; 3]>, ImagesError> {
+    let bytes = bytes(&spec.path, spec.hash)?;
+    let name = || spec.path.display().to_string();
+    decode_image(&spec.path, &bytes).map_err(|source| ImagesError::Decode { name: name(), source })
+}
+
+/// The bytes of a file, which must be those that the run was planned with.
+fn bytes(path: &Path, hash: BlobKey) -> Result<Vec<u8>, ImagesError> {
+    let bytes = std::fs::read(path).map_err(|source| ImagesError::Read { path: path.to_owned(), source })?;
+    if BlobKey::of(&bytes) == hash { Ok(bytes) } else { Err(ImagesError::Changed { path: path.to_owned() }) }
+}
+
 fn load(spec: &ImageSpec) -> Result<WorkingImage, ImagesError> {
-    let path = || spec.path.clone();
-    let bytes = std::fs::read(&spec.path).map_err(|source| ImagesError::Read { path: path(), source })?;
-    if BlobKey::of(&bytes) != spec.hash {
-        return Err(ImagesError::Changed { path: path() });
-    }
+    let bytes = bytes(&spec.path, spec.hash)?;
     let name = || spec.name.clone();
     let pixels =
         decode_image(&spec.path, &bytes).map_err(|source| ImagesError::Decode { name: name(), source })?;

@@ -9,7 +9,7 @@ use planesweep_fusion::{
     FilteredMap, Funnel, VertexFormat, decode_filtered_map, emit, emitted, encode, encode_filtered_map,
     filter,
 };
-use planesweep_plan::{BlobKey, EmitSpec, FilterSpec, InferSpec, JobId, JobSpec};
+use planesweep_plan::{BlobKey, EmitSpec, FilterSpec, FitSpec, InferSpec, JobId, JobSpec};
 use planesweep_proto::{Grant, Input, Produced, Success, Way};
 use planesweep_scene::DepthMap;
 use tokio::sync::Semaphore;
@@ -21,7 +21,7 @@ use crate::cloud::assemble;
 use crate::device::{Device, InferRequest};
 use crate::exchange::{Exchange, Written};
 use crate::failure::JobError;
-use crate::images::Images;
+use crate::images::{Images, load_mask};
 use crate::maps::Maps;
 use crate::store::{Store, StoreError};
 
@@ -69,6 +69,10 @@ impl Jobs {
             JobSpec::Stitch(_) => {
                 started();
                 self.stitch(&grant.inputs).await?
+            }
+            JobSpec::Fit(spec) => {
+                started();
+                self.fit(spec, &grant.inputs).await?
             }
             JobSpec::Filter(spec) => {
                 started();
@@ -133,6 +137,23 @@ impl Jobs {
             all_or_lost(bands)?.into_iter().collect::<Option<Vec<_>>>().ok_or(JobError::NoDepthMap)?;
         let bands: Vec<DepthMap> = bands.iter().map(|band| DepthMap::clone(band)).collect();
         Ok((self.keep(DepthMap::stitch(&bands)?).await, counted(&ways)))
+    }
+
+    async fn fit(&self, spec: &FitSpec, inputs: &[Input]) -> Result<Made, JobError> {
+        let input = inputs.first().ok_or(JobError::NoDepthMap)?;
+        let mut ways = Ways::new();
+        let map = self.depth_map(input, &mut ways).await?.ok_or(JobError::NoDepthMap)?;
+        let image = self.images.get(&spec.image).await?;
+        let FitSpec { mask, full_resolution, .. } = spec.clone();
+        let fitted = compute(move || {
+            let mut map = DepthMap::clone(&map);
+            if let Some(mask) = &mask {
+                map.leave_out(&load_mask(mask)?);
+            }
+            Ok::<_, JobError>(if full_resolution { map.upsampled(&image) } else { map })
+        })
+        .await?;
+        Ok((self.keep(fitted).await, counted(&ways)))
     }
 
     /// The map as bytes. It stays in memory too, for neighbouring views filter against it soon.

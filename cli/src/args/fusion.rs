@@ -32,6 +32,10 @@ pub struct FilterArgs {
     /// Views that a depth map is checked against.
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub fusion_views: u32,
+    /// Fuse at the resolution of the working images, four times that of the network's depth maps: these are upsampled,
+    /// guided by the photographs. Thresholds stay in pixels of the network's depth maps.
+    #[arg(long)]
+    pub full_resolution: bool,
     /// Emit a surface from every view that keeps it, not only from the one that sees it best.
     #[arg(long)]
     pub every_view: bool,
@@ -77,6 +81,7 @@ impl FilterArgs {
             max_reprojection_px: self.max_reprojection.unwrap_or(defaults.max_reprojection_px),
             max_relative_depth: self.max_depth_difference.unwrap_or(defaults.max_relative_depth),
             sampling: if self.continuous { DepthSampling::Continuous } else { defaults.sampling },
+            network_pixel: defaults.network_pixel,
         }
     }
 }

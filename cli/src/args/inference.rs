@@ -19,6 +19,9 @@ pub enum Quality {
     Paper,
 }
 
+/// Pixels of the working image to one of the network's depth map.
+const NETWORK_PIXEL: f32 = 4.0;
+
 /// What shapes the plan.
 #[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Inference")]
@@ -67,6 +70,11 @@ impl PlanArgs {
             Quality::Paper => (1920, 5, Some(256)),
         };
         let defaults = PlanOptions::default();
+        let full_resolution = filter.is_some_and(|filter| filter.full_resolution);
+        let mut criteria = filter.map_or(defaults.filter, FilterArgs::options);
+        if full_resolution {
+            criteria.network_pixel = NETWORK_PIXEL;
+        }
         PlanOptions {
             views: self.views.unwrap_or(views),
             fusion_views: filter.map_or(defaults.fusion_views, |f| f.fusion_views),
@@ -79,7 +87,8 @@ impl PlanArgs {
             },
             depth_range: self.depth_range,
             band_rows: self.band_rows,
-            filter: filter.map_or(defaults.filter, FilterArgs::options),
+            filter: criteria,
+            full_resolution,
             once_per_surface: filter.map_or(defaults.once_per_surface, |f| !f.every_view),
         }
     }

@@ -62,7 +62,7 @@ impl<'a> Finished<'a> {
 
     /// The job whose result is the depth map of a view.
     fn depth_map(&self, view: ViewId) -> Option<&'a JobResult> {
-        self.result("stitch", Some(view)).or_else(|| self.result("infer", Some(view)))
+        ["fit", "stitch", "infer"].into_iter().find_map(|kind| self.result(kind, Some(view)))
     }
 
     fn infer_seconds(&self, view: ViewId) -> f64 {
@@ -98,7 +98,7 @@ pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Out
     let points = vertices(&cloud).count() as u64;
 
     // Kinds of jobs overlap in time and run on several workers, so these are sums, not parts.
-    for kind in ["infer", "stitch", "filter", "emit", "assemble"] {
+    for kind in ["infer", "stitch", "fit", "filter", "emit", "assemble"] {
         let of_kind = run.results.iter().filter(|result| result.kind == kind);
         if of_kind.clone().next().is_some() {
             stages.push((format!("{kind}, summed"), of_kind.map(own_seconds).sum()));
@@ -328,6 +328,8 @@ fn report(
         ("sampling", json!(options.sampling)),
         ("fusion", json!(filter.method)),
         ("each surface is emitted once", json!(options.once_per_surface)),
+        ("full resolution", json!(options.full_resolution)),
+        ("views with a mask", json!(run.prepared.plan.masks.len())),
         ("confidence threshold", json!(filter.min_confidence)),
         ("views that must agree, reference included", json!(filter.min_views)),
         ("reprojection threshold in pixels of the depth map", json!(filter.max_reprojection_px)),

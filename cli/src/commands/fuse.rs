@@ -13,13 +13,14 @@ use planesweep_fusion::{
     Work, fuse_out_of_core,
 };
 use planesweep_plan::{BlobKey, NUMERICS_VERSION};
-use planesweep_scene::{DepthMap, ViewId};
+use planesweep_scene::{DepthFiles, DepthMap, ViewId};
 use serde_json::json;
 
 use crate::args::values::bytes;
 use crate::args::{FilterArgs, ReadArgs};
 use crate::console::{Outcome, Progress};
 use crate::depth_maps::{self, DepthMaps, Neighbourhood};
+use crate::workspace::Workspace;
 
 /// Arguments of `fuse`.
 #[derive(Debug, Args)]
@@ -51,6 +52,10 @@ pub struct FuseArgs {
     /// Write which views see each point to OUT.vis, as COLMAP does beside its fused.ply.
     #[arg(long)]
     pub vis: bool,
+    /// Write photographs, cameras, depth and normal maps as a dense workspace of COLMAP to this folder, too, for its
+    /// stereo_fusion and its meshers.
+    #[arg(long, value_name = "FOLDER")]
+    pub workspace: Option<PathBuf>,
     /// Forget what an interrupted run for the same file has done.
     #[arg(long)]
     pub fresh: bool,
@@ -81,8 +86,8 @@ impl From<PresetArg> for Preset {
     }
 }
 
-/// Memory of the program itself and of the view in work, in multiples of its pixels.
-const BASE_BYTES: u64 = 48 << 20;
+/// Memory of the program itself, most of it the network's library, and of the view in work, in multiples of its pixels.
+const BASE_BYTES: u64 = 120 << 20;
 const WORK_BYTES_PER_PIXEL: u64 = 256;
 /// Less for the maps than this is no use.
 const LEAST_MAP_BYTES: u64 = 16 << 20;
@@ -92,7 +97,7 @@ pub fn run(args: &FuseArgs, json: bool) -> Result<Outcome> {
     let begun = Instant::now();
     let format = Format::of(&args.out)?;
     let preset = args.preset.map(Preset::from);
-    let options = match preset {
+    let mut options = match preset {
         Some(preset) => args.filter.options_over(preset.options()),
         None => args.filter.options(),
     };
@@ -102,14 +107,20 @@ pub fn run(args: &FuseArgs, json: bool) -> Result<Outcome> {
     for warning in &maps.warnings {
         eprintln!("warning: {warning}");
     }
+    options.network_pixel = maps.network_pixel;
+    if args.filter.full_resolution {
+        options.network_pixel *= upsampling(&maps);
+    }
     let work = work(args, &maps, options);
     if args.fresh && work.scratch.exists() {
         fs::remove_dir_all(&work.scratch)
             .with_context(|| format!("cannot remove {}", work.scratch.display()))?;
     }
     let mut outputs = Outputs::create(args, format, &maps)?;
+    let mut workspace = args.workspace.clone().map(Workspace::create).transpose()?;
     let load = |view: ViewId| -> Result<DepthMap, Box<dyn std::error::Error + Send + Sync>> {
-        Ok(maps.files[&view].read()?)
+        let files = &maps.files[&view];
+        Ok(if args.filter.full_resolution { files.read_upsampled()? } else { files.read()? })
     };
     let mut progress = Progress::new(2 * work.views.len() as u64);
     let mut show = |done: usize| {
@@ -117,7 +128,12 @@ pub fn run(args: &FuseArgs, json: bool) -> Result<Outcome> {
             progress.show(done as u64, String::new());
         }
     };
-    let fused = fuse_out_of_core(&work, &load, &mut show, &mut |points| outputs.write(&points))?;
+    let fused = fuse_out_of_core(&work, &load, &mut show, &mut |points| {
+        if let Some(workspace) = &mut workspace {
+            workspace.add(&maps.files[&points.view], points.map, points.neighbours)?;
+        }
+        outputs.write(&points)
+    })?;
     progress.finish();
     let funnel: Funnel = fused.funnels.values().copied().sum();
     if let Some(empty) = funnel.emptied_by() {
@@ -125,6 +141,7 @@ pub fn run(args: &FuseArgs, json: bool) -> Result<Outcome> {
         let why = read.map(|(view, why)| format!("; view {view}: {why}")).unwrap_or_default();
         bail!("{empty}{why}");
     }
+    workspace.map(Workspace::finish).transpose()?;
     outputs.finish()?;
     fs::remove_dir_all(&work.scratch).with_context(|| format!("cannot remove {}", work.scratch.display()))?;
     Ok(outcome(args, &maps, &fused, options, begun))
@@ -132,7 +149,8 @@ pub fn run(args: &FuseArgs, json: bool) -> Result<Outcome> {
 
 fn work(args: &FuseArgs, maps: &DepthMaps, options: FilterOptions) -> Work {
     let views = maps.order.iter().map(|view| (*view, maps.neighbours[view].clone())).collect();
-    let fingerprint = format!("{NUMERICS_VERSION} {options:?}\n{}", maps.fingerprint());
+    let fingerprint =
+        format!("{NUMERICS_VERSION} {options:?} {}\n{}", args.filter.full_resolution, maps.fingerprint());
     let largest = maps.files.values().map(|files| files.view.camera.intrinsics).map(|k| k.width * k.height);
     let working = BASE_BYTES + WORK_BYTES_PER_PIXEL * u64::from(largest.max().unwrap_or(0)) / 16;
     Work {
@@ -143,6 +161,15 @@ fn work(args: &FuseArgs, maps: &DepthMaps, options: FilterOptions) -> Work {
         scratch: beside(&args.out, ".parts"),
         fingerprint: BlobKey::of(fingerprint.as_bytes()).to_string(),
     }
+}
+
+/// Pixels of the photographs to one of the depth maps: of the first pair that can be read.
+fn upsampling(maps: &DepthMaps) -> f32 {
+    let read = |files: &DepthFiles| {
+        let (map, photograph) = files.read_with_photograph().ok()?;
+        Some(photograph.camera.intrinsics.fx / map.camera.intrinsics.fx)
+    };
+    maps.files.values().find_map(read).unwrap_or(1.0) as f32
 }
 
 /// What matters of a coordinate: a tenth of the smallest pixel.

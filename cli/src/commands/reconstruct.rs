@@ -43,6 +43,10 @@ pub struct ReconstructArgs {
     /// Threads of each worker's inference; by default the processors are shared evenly.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
+    /// Folder with a mask per view, NAME.png or STEM.png: what is black there gets no depth. By default
+    /// STEM.mask.png beside the photographs.
+    #[arg(long, value_name = "DIR")]
+    pub masks: Option<PathBuf>,
     /// Forget what an earlier run in the same folder has done.
     #[arg(long)]
     pub fresh: bool,
@@ -75,7 +79,14 @@ pub fn run(args: &ReconstructArgs, json: bool, verbose: u8) -> Result<Outcome> {
     check_out(&args.out, &args.scene)?;
     let refined = network.weights.metadata().refinement != Refinement::None;
     let options = args.plan.options(Some(&args.filter));
-    let prepared = Prepared::new(&args.scene, network, &options, &args.read.options(), &mut stages)?;
+    let prepared = Prepared::new(
+        &args.scene,
+        network,
+        &options,
+        &args.read.options(),
+        args.masks.as_deref(),
+        &mut stages,
+    )?;
     let workers = args.workers.unwrap_or_else(|| default_workers(&prepared.plan, &placement.device, refined));
     let placement = Placement {
         threads: args.threads.map_or((processors() / workers as usize).max(1), |threads| threads as usize),

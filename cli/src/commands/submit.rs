@@ -40,6 +40,10 @@ pub struct SubmitArgs {
     /// Where the workers infer; only `analytic`, the test double, makes a difference.
     #[arg(long, hide = true, default_value = "cpu")]
     pub device: String,
+    /// Folder with a mask per view, NAME.png or STEM.png: what is black there gets no depth. By default
+    /// STEM.mask.png beside the photographs.
+    #[arg(long, value_name = "DIR")]
+    pub masks: Option<PathBuf>,
     #[command(flatten)]
     pub plan: PlanArgs,
     #[command(flatten)]
@@ -66,7 +70,14 @@ pub fn run(args: &SubmitArgs, json: bool) -> Result<Outcome> {
     }
     let network = Network::read(args.weights.as_deref(), &args.device)?;
     let options = args.plan.options(Some(&args.filter));
-    let prepared = Prepared::new(&args.scene, network, &options, &args.read.options(), &mut stages)?;
+    let prepared = Prepared::new(
+        &args.scene,
+        network,
+        &options,
+        &args.read.options(),
+        args.masks.as_deref(),
+        &mut stages,
+    )?;
     if !json {
         eprintln!("{} views to infer, {} left out", prepared.plan.views.len(), prepared.left_out());
     }

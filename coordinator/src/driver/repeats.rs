@@ -43,6 +43,10 @@ fn nameless(job: &Job) -> Job {
             spec.sources = spec.sources.iter().map(image).collect();
         }
         JobSpec::Stitch(spec) => spec.view = ViewId(0),
+        JobSpec::Fit(spec) => {
+            spec.image = image(&spec.image);
+            spec.mask.iter_mut().for_each(|mask| mask.path = PathBuf::new());
+        }
         JobSpec::Filter(spec) => {
             spec.view = ViewId(0);
             spec.neighbours.fill(ViewId(0));

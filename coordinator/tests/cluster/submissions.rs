@@ -33,6 +33,7 @@ fn rename(jobs: &mut [Job], by: u32, folder: &Path) {
                 }
             }
             JobSpec::Stitch(spec) => renumber(&mut spec.view),
+            JobSpec::Fit(spec) => renumber(&mut spec.image.view),
             JobSpec::Filter(spec) => {
                 renumber(&mut spec.view);
                 spec.neighbours.iter_mut().for_each(renumber);

@@ -60,6 +60,8 @@ pub struct ViewPoints<'a> {
     pub neighbours: &'a [ViewId],
     /// They, row by row from the top.
     pub points: &'a [Point],
+    /// What they were chosen from.
+    pub map: &'a FilteredMap,
 }
 
 /// What became of the views.
@@ -214,7 +216,7 @@ fn emit_all(
         let chosen: Raster<bool> = emitted(map, &others, work.options.max_relative_depth);
         let emitted = emit(map, &chosen);
         fused.funnels.insert(*view, Funnel { emitted: emitted.len() as u64, ..map.funnel });
-        points(ViewPoints { view: *view, neighbours, points: &emitted })
+        points(ViewPoints { view: *view, neighbours, points: &emitted, map })
             .map_err(|source| OutOfCoreError::Points { view: *view, source })?;
         progress(work.views.len() + step + 1);
     }

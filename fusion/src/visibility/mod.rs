@@ -67,7 +67,7 @@ impl<'a> Candidates<'a> {
         let Scratch { candidates, transfers } = scratch;
         transfers.clear();
         transfers.extend(self.neighbours.iter().map(|neighbour| neighbour.row_transfer(y)));
-        row.clear();
+        row.clear(self.reference.width());
         let mut counts = RowCounts::default();
         for x in 0..self.reference.width() {
             let (depth, confidence) = (self.reference.depth.at(x, y), self.reference.confidence.at(x, y));
@@ -86,9 +86,10 @@ impl<'a> Candidates<'a> {
             if let Some(chosen) = chosen {
                 let agrees =
                     |own: &Candidate| (own.depth - chosen).abs() < self.options.max_relative_depth * chosen;
-                row.push(x, chosen, own.filter(agrees).map_or(0.0, |own| own.depth));
+                row.push_if(true, x, chosen, own.filter(agrees).map_or(0.0, |own| own.depth));
             }
         }
+        row.end();
         counts
     }
 }

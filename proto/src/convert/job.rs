@@ -7,7 +7,8 @@ use std::path::PathBuf;
 use nalgebra::{Matrix3, Vector3};
 use planesweep_fusion::{DepthSampling, FilterOptions, FusionMethod};
 use planesweep_plan::{
-    AssembleSpec, BlobKey, EmitSpec, FilterSpec, ImageSpec, InferSpec, Job, JobId, JobSpec, StitchSpec,
+    AssembleSpec, BlobKey, EmitSpec, FilterSpec, FitSpec, ImageSpec, InferSpec, Job, JobId, JobSpec,
+    MaskSpec, StitchSpec,
 };
 use planesweep_scene::{
     Camera, CameraError, DepthHypotheses, Distortion, Intrinsics, Pose, Sampling, ViewId,
@@ -78,6 +79,14 @@ impl From<&JobSpec> for wire::JobSpec {
             spec: Some(match spec {
                 JobSpec::Infer(spec) => Spec::Infer(spec.into()),
                 JobSpec::Stitch(spec) => Spec::Stitch(wire::StitchSpec { view: spec.view.0 }),
+                JobSpec::Fit(spec) => Spec::Fit(wire::FitSpec {
+                    image: Some((&spec.image).into()),
+                    mask: spec.mask.as_ref().map(|mask| wire::Mask {
+                        path: mask.path.as_os_str().as_bytes().to_vec(),
+                        hash: mask.hash.0.to_vec(),
+                    }),
+                    full_resolution: spec.full_resolution,
+                }),
                 JobSpec::Filter(spec) => Spec::Filter(wire::FilterSpec {
                     view: spec.view.0,
                     neighbours: numbers(&spec.neighbours),
@@ -103,6 +112,11 @@ impl TryFrom<wire::JobSpec> for JobSpec {
         Ok(match required("spec", spec.spec)? {
             Spec::Infer(spec) => Self::Infer(spec.try_into()?),
             Spec::Stitch(spec) => Self::Stitch(StitchSpec { view: ViewId(spec.view) }),
+            Spec::Fit(spec) => Self::Fit(FitSpec {
+                image: required("image", spec.image)?.try_into()?,
+                mask: spec.mask.map(mask).transpose()?,
+                full_resolution: spec.full_resolution,
+            }),
             Spec::Filter(spec) => Self::Filter(FilterSpec {
                 view: ViewId(spec.view),
                 neighbours: views("neighbours", spec.neighbours)?,
@@ -117,6 +131,10 @@ impl TryFrom<wire::JobSpec> for JobSpec {
             Spec::Assemble(spec) => Self::Assemble(AssembleSpec { views: views("views", spec.views)? }),
         })
     }
+}
+
+fn mask(mask: wire::Mask) -> Result<MaskSpec, WireError> {
+    Ok(MaskSpec { path: path(mask.path)?, hash: blob_key("mask hash", &mask.hash)? })
 }
 
 fn numbers(views: &[ViewId]) -> Vec<u32> {
@@ -353,6 +371,7 @@ impl From<FilterOptions> for wire::FilterOptions {
             min_views: options.min_views,
             sampling: sampling.into(),
             method: method.into(),
+            network_pixel: options.network_pixel,
         }
     }
 }
@@ -386,6 +405,14 @@ impl TryFrom<wire::FilterOptions> for FilterOptions {
                 Ok(wire::FusionMethod::Visibility) => FusionMethod::Visibility,
                 Ok(wire::FusionMethod::VisibilityConfidence) => FusionMethod::VisibilityConfidence,
                 _ => return Err(WireError::UnknownValue { field: "method", value: options.method }),
+            },
+            network_pixel: match options.network_pixel {
+                0.0 => 1.0,
+                pixel if pixel > 0.0 && pixel.is_finite() => pixel,
+                pixel => {
+                    let (field, value) = ("network_pixel", pixel.into());
+                    return Err(WireError::BadNumber { field, value, expected: "positive" });
+                }
             },
         })
     }
@@ -486,6 +513,7 @@ mod tests {
                     max_relative_depth,
                     min_views,
                     sampling: if plain { DepthSampling::Bilinear } else { DepthSampling::Continuous },
+                    network_pixel: if plain { 1.0 } else { 4.0 },
                 }
             },
         )
@@ -497,10 +525,22 @@ mod tests {
         }
     }
 
+    fn fit() -> impl Strategy<Value = FitSpec> {
+        let mask = prop::option::of((vec(1..=255_u8, 0..40), any::<[u8; 32]>()));
+        (image(), mask, any::<bool>()).prop_map(|(image, mask, full_resolution)| {
+            let mask = mask.map(|(path, hash)| MaskSpec {
+                path: PathBuf::from(OsString::from_vec(path)),
+                hash: BlobKey(hash),
+            });
+            FitSpec { image, mask, full_resolution }
+        })
+    }
+
     fn job() -> impl Strategy<Value = Job> {
         let spec = prop_oneof![
             infer().prop_map(JobSpec::Infer),
             any::<u32>().prop_map(|view| JobSpec::Stitch(StitchSpec { view: ViewId(view) })),
+            fit().prop_map(JobSpec::Fit),
             filter().prop_map(JobSpec::Filter),
             (any::<u32>(), view_list(), 0.0..1.0_f32, any::<bool>()).prop_map(
                 |(view, neighbours, max_relative_depth, double)| {

@@ -35,7 +35,7 @@ pub fn write_colmap_text(scene: &Scene, root: &Path) -> Result<(), WriteError> {
 
 /// Writes what makes a dense workspace of a model of undistorted images: `stereo/` with its folders,
 /// `patch-match.cfg` with the source views of `pairs` or for COLMAP to choose, and `fusion.cfg`.
-pub(super) fn write_workspace(
+pub fn write_colmap_workspace(
     scene: &Scene,
     pairs: &BTreeMap<ViewId, Vec<crate::SourceScore>>,
     root: &Path,

@@ -2,6 +2,7 @@
 
 mod atomic;
 mod colmap;
+mod colmap_array;
 mod held;
 mod images;
 mod mvsnet;
@@ -15,7 +16,8 @@ use nalgebra::Point3;
 use thiserror::Error;
 
 pub use atomic::write_atomically;
-pub use colmap::{write_colmap, write_colmap_text};
+pub use colmap::{write_colmap, write_colmap_text, write_colmap_workspace};
+pub use colmap_array::write_colmap_array;
 pub use held::{Held, held};
 pub use mvsnet::{mvsnet_cam_text, mvsnet_pair_text, write_mvsnet};
 pub use openmvg::write_openmvg;
@@ -94,7 +96,7 @@ pub fn write_scene(
         TargetFormat::OpenMvg => write_openmvg(&held.scene, root)?,
     }
     if undistort && matches!(format, TargetFormat::Colmap | TargetFormat::ColmapText) {
-        colmap::write_workspace(&held.scene, &scene.pairs, root)?;
+        write_colmap_workspace(&held.scene, &scene.pairs, root)?;
     }
     Ok(held)
 }
