@@ -17,7 +17,7 @@ pub(crate) fn confident_depths(
     for (x, (&depth, &confidence)) in map.depth.row(y).iter().zip(map.confidence.row(y)).enumerate() {
         let has_depth = depth > 0.0;
         with_depth += usize::from(has_depth);
-        row.push_if(has_depth & (confidence >= min_confidence), x, depth, depth);
+        row.push_if(has_depth && confidence >= min_confidence, x, depth, depth);
     }
     row.end();
     with_depth

@@ -25,7 +25,6 @@ pub struct Job {
 
 /// What a job does.
 #[derive(Clone, Debug, PartialEq)]
-#[expect(clippy::large_enum_variant, reason = "a third of all jobs are the large variant")]
 pub enum JobSpec {
     /// Infers the depth map of a view, or a band of its rows.
     Infer(InferSpec),

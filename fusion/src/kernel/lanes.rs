@@ -136,7 +136,7 @@ impl Lanes for Portable {
     }
     #[inline(always)]
     unsafe fn but_not(a: Self::M, b: Self::M) -> Self::M {
-        each(a, b, |a, b| a & !b)
+        each(a, b, |a, b| a && !b)
     }
     #[inline(always)]
     unsafe fn bits(m: Self::M) -> u32 {
