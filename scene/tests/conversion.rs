@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use image::RgbImage;
 use nalgebra::{Matrix3, Point2, Point3, Vector3};
 use planesweep_scene::{
-    Camera, DepthRange, Distortion, Held, Intrinsics, Pose, ReadOptions, Scene, SourceScore, TargetFormat, View,
-    ViewId, held, read_image, read_scene, write_scene,
+    Camera, DepthRange, Distortion, Held, Intrinsics, Pose, ReadOptions, Scene, SourceScore, TargetFormat,
+    View, ViewId, held, read_image, read_scene, write_scene,
 };
 use proptest::prelude::*;
 
@@ -216,7 +216,8 @@ fn assert_same_photographs(held: &Held, original: &Scene) {
             assert!(bytes(&written.image) == bytes(&stored.image), "{}", written.name);
             continue;
         }
-        let (image, photograph) = [&written.image, &stored.image].map(|path| read_image(path).expect("read")).into();
+        let (image, photograph) =
+            [&written.image, &stored.image].map(|path| read_image(path).expect("read")).into();
         let (k, lens) = (&stored.camera.intrinsics, &stored.distortion);
         let (mut sum, mut count) = (0.0, 0_usize);
         for row in (0..image.height()).step_by(COMPARED) {
@@ -225,7 +226,8 @@ fn assert_same_photographs(held: &Held, original: &Scene) {
                 let (x, y) = lens.distort(ray.x, ray.y);
                 let (u, v) = (k.fx * x + k.skew * y + k.cx, k.fy * y + k.cy);
                 let (left, top) = (u.floor(), v.floor());
-                let inside = left >= 0.0 && top >= 0.0 && left + 1.0 < k.width as f64 && top + 1.0 < k.height as f64;
+                let inside =
+                    left >= 0.0 && top >= 0.0 && left + 1.0 < k.width as f64 && top + 1.0 < k.height as f64;
                 if !inside {
                     continue;
                 }

@@ -67,7 +67,11 @@ fn openmvg_is_read_in_old_and_new_nesting_with_types_named_once() {
     let k = scene.views[&ViewId(5)].camera.intrinsics;
     assert_eq!((k.fx, k.fy, k.cx, k.cy, k.width), (21.0, 21.0, 8.0, 6.0, 16));
     assert_eq!(scene.points.iter().next().expect("a point").1, [ViewId(4), ViewId(7)]);
-    assert!(scene.warnings.len() == 1 && scene.warnings[0].what.starts_with("1 views of"), "{:?}", scene.warnings);
+    assert!(
+        scene.warnings.len() == 1 && scene.warnings[0].what.starts_with("1 views of"),
+        "{:?}",
+        scene.warnings
+    );
 }
 
 #[test]

@@ -1,9 +1,9 @@
 //! Benchmarks run and judged by the program, on small scenes in the benchmarks' own folders.
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use planesweep_tests::{benchmarks, run, seeded_weights};
+use planesweep_tests::{Bench, Cluster, benchmarks, run, seeded_weights};
 use serde_json::Value;
 
 /// Runs a benchmark on the device that knows the surface.
@@ -74,6 +74,31 @@ fn dtu() {
         "{table}"
     );
     assert!(folder.join("out/evaluation/scan4/error_histogram.png").is_file());
+}
+
+#[test]
+fn on_a_coordinator_elsewhere_the_clouds_are_the_same() {
+    let bench = Bench::new(|_| ());
+    let root = PathBuf::from(bench.path("."));
+    benchmarks::dtu(&root, 1);
+    let benchmark = |out: &str, more: &[&str]| {
+        let config = root.join(format!("{out}.toml"));
+        let weights = bench.weights();
+        let options = OPTIONS.replace(", \"--workers\", \"1\"", "");
+        let text = format!(
+            "preset = \"dtu\"\nnames = [\"scan1\"]\nscenes = \"scenes\"\ntruth = \"truth\"\nout = \"{out}\"\n\
+             weights = \"{weights}\"\n{options}"
+        );
+        fs::write(&config, text).expect("written");
+        let given = ["benchmark", config.to_str().expect("UTF-8"), "--json"];
+        run(given.iter().chain(more)).expect_code(0).json()
+    };
+    let here = benchmark("here", &[]);
+    let cluster = Cluster::start(&bench, &[]);
+    let _worker = cluster.worker(&["--device", "analytic"]);
+    let there = benchmark("there", &["--coordinator", cluster.url()]);
+    assert_eq!(here["measured"], there["measured"]);
+    assert_eq!(bench.read("here/scan1/cloud.ply"), bench.read("there/scan1/cloud.ply"));
 }
 
 #[test]

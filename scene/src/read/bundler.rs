@@ -12,7 +12,7 @@ use super::names::resolve_inside;
 use super::points::PointsInto;
 use super::views::{Candidate, Geometry, admit};
 use super::{ReadError, ReadOptions, ViewError, inconsistent, read_text, relative_name};
-use crate::{CameraError, Distortion, Intrinsics, Pose, Scene, ViewId, image_size, Warning};
+use crate::{CameraError, Distortion, Intrinsics, Pose, Scene, ViewId, Warning, image_size};
 
 /// Names of the list of images, after the name of the bundle file itself.
 const LISTS: [&str; 3] = ["list.txt", "list_focal.txt", "image_list.txt"];

@@ -45,7 +45,8 @@ pub(super) fn read(root: &Path, options: &ReadOptions) -> Result<Scene, ReadErro
         let path = cams.join(&file);
         let geometry = parse_camera(&read_text(&path)?, options).map_err(|error| error.at(path)).map(
             |(geometry, warning)| {
-                let advice = "mend the line (least depth, interval, number of planes), or give --depth-range NEAR,FAR";
+                let advice =
+                    "mend the line (least depth, interval, number of planes), or give --depth-range NEAR,FAR";
                 let what = warning.map(|warning| format!("cams/{file}: {warning}"));
                 scene.warnings.extend(what.map(|what| Warning::new(what, advice)));
                 geometry

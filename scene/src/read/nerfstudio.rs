@@ -13,7 +13,7 @@ use super::json::{json_at, number};
 use super::names::resolve_inside;
 use super::views::{Candidate, Geometry, admit};
 use super::{ReadError, ReadOptions, ViewError, inconsistent, relative_name};
-use crate::{Distortion, Intrinsics, Pose, Scene, ViewId, image_size, Warning};
+use crate::{Distortion, Intrinsics, Pose, Scene, ViewId, Warning, image_size};
 
 #[derive(Deserialize)]
 struct Transforms {

@@ -60,10 +60,7 @@ pub(super) fn parse_pairs(
     }
     if given < count {
         warnings.push(Warning::new(
-            format!(
-                "{}: {count} reference views are announced, the file ends after {given}",
-                path.display()
-            ),
+            format!("{}: {count} reference views are announced, the file ends after {given}", path.display()),
             "look for a complete copy; views that are missing there get sources by overlap",
         ));
     }
@@ -182,7 +179,10 @@ mod tests {
         for text in ["4294967295\n0\n1 1 5\n", "2\n0\n1 1 5\n3\n"] {
             let (pairs, warnings) = parsed(text);
             assert_eq!(ids(&pairs.expect("clear enough"), 0), [1]);
-            assert!(warnings.len() == 1 && warnings[0].what.ends_with("the file ends after 1"), "{warnings:?}");
+            assert!(
+                warnings.len() == 1 && warnings[0].what.ends_with("the file ends after 1"),
+                "{warnings:?}"
+            );
         }
     }
 

@@ -7,7 +7,9 @@ use rayon::prelude::*;
 
 use super::names::{ResolveError, resolve_inside};
 use super::{ReadError, ReadOptions, ViewError, inconsistent};
-use crate::{Camera, DepthRange, Distortion, Intrinsics, Pose, Scene, View, ViewId, fit_to_image, image_size, Warning};
+use crate::{
+    Camera, DepthRange, Distortion, Intrinsics, Pose, Scene, View, ViewId, Warning, fit_to_image, image_size,
+};
 
 /// A view as a format's files describe it, before its image was looked at.
 pub(super) struct Candidate {
