@@ -79,7 +79,9 @@ fn views_agree_on_true_depth() {
     let exact = consistent(&measure(&bench, "consistency"));
     replace_depth(&bench, wrong);
     let off = consistent(&measure(&bench, "consistency"));
-    eprintln!("{exact:.3} of the pixels are consistent with true depth, {off:.3} with depth that is up to 21 % off");
+    eprintln!(
+        "{exact:.3} of the pixels are consistent with true depth, {off:.3} with depth that is up to 21 % off"
+    );
     assert!(exact > 0.7 && off < 0.2 * exact, "{exact} {off}");
 }
 
