@@ -2,15 +2,33 @@
 
 use std::path::PathBuf;
 use std::sync::{Arc, Once};
+use std::time::Duration;
 
+use object_store::aws::AmazonS3Builder;
+use object_store::azure::MicrosoftAzureBuilder;
+use object_store::gcp::GoogleCloudStorageBuilder;
 use object_store::local::LocalFileSystem;
 use object_store::prefix::PrefixStore;
-use object_store::{ObjectStore, parse_url_opts};
+use object_store::{ObjectStore, ObjectStoreScheme, RetryConfig};
 use url::Url;
 
 use crate::StoreError;
 
+/// The builders are alike, but share no trait.
+macro_rules! built {
+    ($builder:ident, $provider:literal, $url:ident, $variables:ident) => {{
+        let mut builder = $builder::new().with_url($url).with_retry(retries());
+        for (name, value) in options($provider, $variables) {
+            if let Ok(key) = name.parse() {
+                builder = builder.with_config(key, value);
+            }
+        }
+        builder.build().map(|objects| Arc::new(objects) as Arc<dyn ObjectStore>)
+    }};
+}
+
 /// Opens what lies at an address. A local folder is made if it is not there.
+///
 /// `variables` say the endpoint, region and keys of an object store, under the names that the tools of each
 /// provider use.
 pub(crate) fn open(
@@ -24,17 +42,31 @@ pub(crate) fn open(
         return Ok(Arc::new(local.with_fsync(true)));
     }
     let parsed = Url::parse(url).map_err(|e| error(e.to_string()))?;
-    if !["s3", "s3a", "gs", "az", "azure", "abfs", "abfss"].contains(&parsed.scheme()) {
-        return Err(error("only file://, s3://, gs:// and az:// are understood".to_owned()));
-    }
+    let (scheme, prefix) = ObjectStoreScheme::parse(&parsed).map_err(|e| error(e.to_string()))?;
     choose_cryptography();
-    let (objects, prefix) = parse_url_opts(&parsed, options(variables)).map_err(|e| error(e.to_string()))?;
+    let built = match scheme {
+        ObjectStoreScheme::AmazonS3 => built!(AmazonS3Builder, "aws_", url, variables),
+        ObjectStoreScheme::GoogleCloudStorage => built!(GoogleCloudStorageBuilder, "google_", url, variables),
+        ObjectStoreScheme::MicrosoftAzure => built!(MicrosoftAzureBuilder, "azure_", url, variables),
+        _ => return Err(error("only file://, s3://, gs:// and az:// are understood".to_owned())),
+    };
+    let objects = built.map_err(|e: object_store::Error| error(e.to_string()))?;
     Ok(Arc::new(PrefixStore::new(objects, prefix)))
 }
 
-fn options(variables: impl IntoIterator<Item = (String, String)>) -> Vec<(String, String)> {
-    let mut options: Vec<(String, String)> =
-        variables.into_iter().map(|(name, value)| (name.to_ascii_lowercase(), value)).collect();
+/// The tries of one request that follow each other at once; waiting for a store in trouble is not theirs.
+fn retries() -> RetryConfig {
+    RetryConfig { max_retries: 2, retry_timeout: Duration::from_secs(10), ..RetryConfig::default() }
+}
+
+/// The provider's variables, with small letters, as the builders parse them.
+fn options(provider: &str, variables: impl IntoIterator<Item = (String, String)>) -> Vec<(String, String)> {
+    // Builders take names without the provider's, too, and an environment may have a TOKEN of its own.
+    let mut options: Vec<(String, String)> = variables
+        .into_iter()
+        .map(|(name, value)| (name.to_ascii_lowercase(), value))
+        .filter(|(name, _)| name.starts_with(provider))
+        .collect();
     // Who names an endpoint without TLS means it.
     let is_plain = |(name, value): &(String, String)| {
         ["aws_endpoint_url_s3", "aws_endpoint_url", "aws_endpoint"].contains(&name.as_str())
