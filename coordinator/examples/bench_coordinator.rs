@@ -20,7 +20,7 @@ use planesweep_plan::{
     WorkerId,
 };
 use planesweep_proto::{
-    CODE_VERSION, Client, FinishedJob, Order, Outcome, PROTOCOL_VERSION, Report, Role, Slots, SubmitHeader,
+    CODE_VERSION, Client, Endpoint, FinishedJob, Order, Outcome, PROTOCOL_VERSION, Report, Role, Slots, SubmitHeader,
     Success, WorkerState,
 };
 use planesweep_scene::{Camera, DepthHypotheses, Distortion, Intrinsics, Pose, Sampling, ViewId};
@@ -100,6 +100,7 @@ async fn work(
             held: Vec::new(),
             finished: std::mem::take(&mut finished),
             max_wait: std::time::Duration::from_secs(2),
+            endpoint: Endpoint::default(),
         };
         let reply = client.report(&report).await?;
         reports.fetch_add(1, Ordering::Relaxed);
