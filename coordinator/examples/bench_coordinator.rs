@@ -20,8 +20,8 @@ use planesweep_plan::{
     WorkerId,
 };
 use planesweep_proto::{
-    CODE_VERSION, Client, Endpoint, FinishedJob, Order, Outcome, PROTOCOL_VERSION, Report, Role, Slots, SubmitHeader,
-    Success, WorkerState,
+    CODE_VERSION, Client, Endpoint, FinishedJob, Order, Outcome, PROTOCOL_VERSION, Report, Role, Slots,
+    SubmitHeader, Success, WorkerState,
 };
 use planesweep_scene::{Camera, DepthHypotheses, Distortion, Intrinsics, Pose, Sampling, ViewId};
 

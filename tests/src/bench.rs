@@ -66,6 +66,11 @@ impl Bench {
         Running::start_in(cluster.environment(), self.arguments("submit", out, &more))
     }
 
+    /// The same to a coordinator that somebody else has started.
+    pub fn submit_to(&self, out: &str, url: &str, more: &[&str]) -> Running {
+        Running::start(self.arguments("submit", out, &[&["--coordinator", url], more].concat()))
+    }
+
     fn arguments(&self, command: &str, out: &str, more: &[&str]) -> Vec<String> {
         let (scene, out, weights) = (self.scene(), self.path(out), self.weights());
         let given = [command, &scene, "-o", &out, "--weights", &weights, "--json"];

@@ -59,7 +59,7 @@ fn jobs_of_slurm_survive_preemption_and_time_limit() {
     wait_for("the coordinator's address", &slurm, folder, || folder.join("address").exists());
     let url = format!("http://127.0.0.1:{port}");
     let token = format!("{shared}/token");
-    let mut struck = bench.submit("struck", &url, &[&SLOW[..], &["--token-file", &token]].concat());
+    let mut struck = bench.submit_to("struck", &url, &[&SLOW[..], &["--token-file", &token]].concat());
     let has_result = |run: &Running| run.stderr().lines().any(|line| line.contains("/25 jobs"));
     wait_for("a result", &slurm, folder, || has_result(&struck) || !struck.is_running());
     assert!(struck.is_running(), "{}", struck.stderr());
