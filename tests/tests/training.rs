@@ -42,6 +42,10 @@ fn a_killed_run_goes_on_to_the_same_weights() {
     let config = folder.path().join("train.toml");
     fs::write(&config, CONFIG).expect("written");
     let (whole, killed) = (folder.path().join("whole"), folder.path().join("killed"));
+    // It ends early where it is told to, and goes on when it no longer is.
+    fs::write(&config, format!("{CONFIG}stop_after = 5\n")).expect("written");
+    assert_eq!(start(&config, &whole).wait().expect_code(0).json()["steps"], 5);
+    fs::write(&config, CONFIG).expect("written");
     let finished = start(&config, &whole).wait().expect_code(0);
     assert_eq!(finished.json()["steps"], 8);
 

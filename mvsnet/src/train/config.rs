@@ -154,6 +154,9 @@ pub struct ProgressConfig {
     pub validation_samples: u64,
     /// Scenes with ground truth that are validated on, too.
     pub validation_scenes: Vec<String>,
+    /// The run ends after this step, before the schedule does, as if it were interrupted there.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stop_after: Option<u64>,
 }
 
 /// What the weights file says, for people.
@@ -266,6 +269,7 @@ impl Default for ProgressConfig {
             validate_every: 1000,
             validation_samples: 16,
             validation_scenes: Vec::new(),
+            stop_after: None,
         }
     }
 }

@@ -169,15 +169,16 @@ impl<'a> Trainer<'a> {
         let progress = &config.progress;
         let mut broken = 0;
         let mut wish = watch(TrainEvent::Begun { step: self.state.step });
-        while self.state.step < config.steps && wish == Wish::GoOn {
+        let end = progress.stop_after.unwrap_or(config.steps).min(config.steps);
+        while self.state.step < end && wish == Wish::GoOn {
             let (report, finite) = self.step(feeder)?;
             broken = if finite { 0 } else { broken + 1 };
             if broken == MOST_BROKEN_STEPS {
                 return Err(TrainError::Diverged { step: report.step, count: broken });
             }
             wish = watch(TrainEvent::Step(report));
-            let (step, last) = (report.step, report.step == config.steps || wish == Wish::Stop);
-            if (step.is_multiple_of(progress.validate_every) && wish == Wish::GoOn) || step == config.steps {
+            let (step, last) = (report.step, report.step == end || wish == Wish::Stop);
+            if (step.is_multiple_of(progress.validate_every) && wish == Wish::GoOn) || step == end {
                 let weights = self.weights(validation)?;
                 let measured = validation.measure(&weights, config.threads)?;
                 watch(TrainEvent::Validated { step, validation: &measured });
