@@ -30,7 +30,7 @@ check: libtorch ## formatting, lints, documentation, licences
 	@if command -v cargo-deny >/dev/null; then cargo deny --log-level error check; \
 	else echo "cargo-deny is not installed, so licences were not checked: cargo install --locked cargo-deny"; fi
 
-demo: release ## make a scene, reconstruct it, compare with its exact depth; needs WEIGHTS=FILE while none are embedded
+demo: release ## make a scene, reconstruct it, compare with its exact depth (WEIGHTS=FILE: with others than our own)
 	@scripts/demo.sh $(PROGRAM) "$(WEIGHTS)"
 
 clean: ## remove what was built, not the cached libtorch

@@ -33,17 +33,12 @@ pub fn read_weights(path: &Path) -> Result<(Vec<u8>, Weights)> {
 
 /// The weights in this file, or those that come with the program.
 pub fn weights_or_default(path: Option<&Path>) -> Result<(Vec<u8>, Weights)> {
-    match (path, Weights::default_file()) {
-        (Some(path), _) => read_weights(path),
-        (None, Some(bytes)) => {
-            let weights = Weights::from_bytes(bytes).context("cannot use the weights of this program")?;
-            Ok((bytes.to_vec(), weights))
-        }
-        (None, None) => bail!(
-            "this program was built without weights; give some with --weights FILE: train them with `planesweep \
-             train`, or make them of a PyTorch checkpoint with `planesweep weights import`"
-        ),
-    }
+    let Some(path) = path else {
+        let bytes = Weights::default_file();
+        let weights = Weights::from_bytes(bytes).context("cannot use the weights of this program")?;
+        return Ok((bytes.to_vec(), weights));
+    };
+    read_weights(path)
 }
 
 /// How a network is run.

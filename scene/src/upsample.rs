@@ -183,7 +183,7 @@ mod tests {
                 let other = if on_disc { 1.0 / (0.25 + 0.0005 * x as f64 - 0.0003 * y as f64) } else { 2.0 };
                 flying += usize::from(error > 0.02 && (depth / other - 1.0).abs() > 0.02);
                 let edge = ((x as f64 - 30.0).hypot(y as f64 - 28.0) - 15.0).abs();
-                assert!(edge < 8.0 || error < 1e-5, "{error} at {x}, {y}");
+                assert!(edge < 8.0 || error < 1e-4, "{error} at {x}, {y}");
             }
         }
         assert_eq!(flying, 0, "no depth lies between the surfaces");

@@ -75,6 +75,21 @@ fn the_number_of_workers_changes_no_bit() {
 }
 
 #[test]
+fn the_weights_that_come_with_the_program_find_the_true_depth() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (scene, out) = (folder.path().join("scene"), folder.path().join("out"));
+    courtyard(&scene, 5, 320, 256);
+    let path = |path: &Path| path.to_str().expect("UTF-8").to_owned();
+    let done = run(["reconstruct", &path(&scene), "-o", &path(&out), "--json"]).expect_code(0).json();
+    assert!(done["points"].as_u64() > Some(2000), "{done}");
+    let truth = path(&scene.join("depth_gt"));
+    let errors = run(["evaluate", "depth", &path(&out), &truth, "--json"]).expect_code(0).json();
+    let median = errors["mean"]["confident"]["median_relative"].as_f64().expect("a number");
+    // A small scene of 320x256; wrong weights are off by tens of percent.
+    assert!(median < 0.03, "the median error is {} %", 100.0 * median);
+}
+
+#[test]
 fn bands_of_rows_change_no_bit() {
     // 2080 rows: four bands of 512 and more.
     let bench = Bench::new(|folder| drop(plane_of_size(folder, 3, 64, 2080)));

@@ -2,13 +2,12 @@
 
 use super::Weights;
 
-/// The safetensors file of the default weights. It stands in `mvsnet/weights/default.safetensors` with the
-/// configuration that trained it beside it; this is the line that embeds it.
-const DEFAULT_FILE: Option<&[u8]> = None;
+/// The safetensors file of the default weights; what trained them stands beside it.
+const DEFAULT_FILE: &[u8] = include_bytes!("../../weights/default.safetensors");
 
 impl Weights {
-    /// The file of the default weights; `None` in a program that was built without any.
-    pub fn default_file() -> Option<&'static [u8]> {
+    /// The file of the default weights.
+    pub fn default_file() -> &'static [u8] {
         DEFAULT_FILE
     }
 }
@@ -19,12 +18,8 @@ mod tests {
 
     #[test]
     fn default_weights_are_whole_and_free() {
-        let Some(file) = Weights::default_file() else {
-            eprintln!("SKIPPED default_weights_are_whole_and_free: no default weights are embedded");
-            return;
-        };
-        let weights = Weights::from_bytes(file).expect("weights of this network");
-        assert_eq!(weights.to_bytes(), file, "the file is as this program writes it");
+        let weights = Weights::from_bytes(DEFAULT_FILE).expect("weights of this network");
+        assert_eq!(weights.to_bytes(), DEFAULT_FILE, "the file is as this program writes it");
         assert!(weights.metadata().licence.contains("MIT"), "{}", weights.metadata().licence);
         assert!(weights.metadata().spacing_px.is_some_and(|px| px > 0.0));
     }
