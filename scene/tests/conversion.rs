@@ -232,12 +232,11 @@ fn assert_same_photographs(held: &Held, original: &Scene) {
                     continue;
                 }
                 let (left, top, u, v) = (left as usize, top as usize, u - left, v - top);
-                let color = image.at(column, row);
-                for channel in 0..3 {
+                for (channel, value) in image.at(column, row).into_iter().enumerate() {
                     let at = |dx, dy| f64::from(photograph.at(left + dx, top + dy)[channel]);
                     let above = at(0, 0) * (1.0 - u) + at(1, 0) * u;
                     let below = at(0, 1) * (1.0 - u) + at(1, 1) * u;
-                    sum += (above * (1.0 - v) + below * v - f64::from(color[channel])).abs();
+                    sum += (above * (1.0 - v) + below * v - f64::from(value)).abs();
                     count += 1;
                 }
             }
