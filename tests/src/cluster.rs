@@ -56,11 +56,14 @@ impl Cluster {
         &mut self.coordinator
     }
 
-    /// Kills the coordinator and starts another on the same ledger and address.
+    /// Kills the coordinator and, when this client misses it, starts another on the same ledger and address.
     #[track_caller]
-    pub fn kill_and_restart(&mut self) {
+    pub fn kill_and_restart(&mut self, client: &Running) {
+        let outages = || client.stderr().matches("the coordinator does not answer").count();
+        let before = outages();
         assert!(self.coordinator.is_running() && send("KILL", self.coordinator.pid()));
         assert!(wait_until(READY, || !self.coordinator.is_running()), "it cannot be killed");
+        assert!(wait_until(READY, || outages() > before), "nobody misses it: {}", client.stderr());
         let address = self.url.rsplit('/').next().expect("an address").to_owned();
         self.coordinator = listening(&address, &self.environment, &self.options);
     }

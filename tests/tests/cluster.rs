@@ -11,6 +11,8 @@ const DEADLINE: Duration = Duration::from_mins(5);
 
 /// Eight views, each slow enough for a fault to meet it.
 const SLOW: [&str; 2] = ["--depths", "128"];
+/// Slow enough for two, although workers go on with what they hold meanwhile.
+const SLOWER: [&str; 2] = ["--depths", "512"];
 const TORCH: [&str; 2] = ["--device", "torch"];
 /// Exit codes of a worker.
 const REFUSED: i32 = 78;
@@ -21,8 +23,8 @@ fn of_courtyard() -> Bench {
 }
 
 /// The undisturbed cloud, by one process of its own.
-fn calm(bench: &Bench) {
-    let _ = bench.reconstruct("calm", &[&SLOW[..], &TORCH, &["--workers", "2"]].concat()).expect_code(0);
+fn calm(bench: &Bench, depths: &[&str]) {
+    let _ = bench.reconstruct("calm", &[depths, &TORCH, &["--workers", "2"]].concat()).expect_code(0);
 }
 
 #[track_caller]
@@ -96,7 +98,7 @@ fn a_cluster_gives_the_cloud_of_one_process_and_is_told_to_go() {
 #[test]
 fn killed_workers_cost_no_view() {
     let bench = of_courtyard();
-    calm(&bench);
+    calm(&bench, &SLOW);
     let cluster = Cluster::start(&bench, &[]);
     let mut workers = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
     let mut struck = bench.submit("struck", &cluster, &SLOW);
@@ -114,14 +116,14 @@ fn killed_workers_cost_no_view() {
 #[test]
 fn a_killed_coordinator_is_restarted_and_loses_nothing() {
     let bench = of_courtyard();
-    calm(&bench);
+    calm(&bench, &SLOWER);
     let mut cluster = Cluster::start(&bench, &[]);
     let _workers = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
-    let mut struck = bench.submit("struck", &cluster, &SLOW);
+    let mut struck = bench.submit("struck", &cluster, &SLOWER);
     for results in [1, 4] {
         wait_for_results(&struck, results);
         assert!(struck.is_running(), "{}", struck.stderr());
-        cluster.kill_and_restart();
+        cluster.kill_and_restart(&struck);
     }
     let struck = struck.wait().expect_code(0);
     assert!(struck.stderr.contains("the coordinator is back"), "{}", struck.stderr);
@@ -137,7 +139,7 @@ fn a_killed_coordinator_is_restarted_and_loses_nothing() {
 #[test]
 fn an_s3_store_that_is_gone_for_a_while_loses_nothing() {
     let bench = of_courtyard();
-    calm(&bench);
+    calm(&bench, &SLOW);
     let mut server = S3Server::start(Path::new(&bench.path("s3")));
     let ledger = bench.path("ledger.sqlite");
     let cluster = Cluster::start_on(&ledger, &server.store_url(), server.environment(), &[]);

@@ -131,6 +131,8 @@ fn containers_on_two_networks_survive_kill_partition_and_restart() {
     // The coordinator dies and comes back on its ledger.
     containers.docker(&["kill", &coordinator]);
     assert_eq!(containers.state(&coordinator)["Running"], false);
+    let is_missed = || containers.logs(&client).contains("the coordinator does not answer");
+    assert!(wait_until(DEADLINE, is_missed), "{}", containers.logs(&client));
     containers.docker(&["start", &coordinator]);
     scenario.wait_for_health();
     let waiting = scenario.wait_for("the run", |s| is_alive(s, "fuse"));
