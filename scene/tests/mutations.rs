@@ -129,13 +129,14 @@ fn scenes(folder: &Path) -> Vec<(PathBuf, Vec<PathBuf>)> {
     let camera = "20 0.1 0.2\n1 0 0\n0 1 0\n0 0 1\n1 2 3\n";
     let bundle = format!("# Bundle file v0.3\n2 1\n{camera}{camera}1 2 3\n4 5 6\n2 0 1 2 3 1 1 2 3\n");
     by_hand("bundler", "bundle.out", bundle.as_bytes());
-    by_hand("openmvs 3", "scene.mvs", &openmvs(3));
-    by_hand("openmvs 7", "scene.mvs", &openmvs(7));
+    by_hand("openmvs 3", "scene.mvs", &openmvs(3, true));
+    by_hand("openmvs 7", "scene.mvs", &openmvs(7, true));
+    by_hand("openmvs without sizes", "scene.mvs", &openmvs(3, false));
     scenes
 }
 
-/// OpenMVS's file in a version of it.
-fn openmvs(version: u32) -> Vec<u8> {
+/// OpenMVS's file in a version of it; without sizes, intrinsics are in units of the larger side.
+fn openmvs(version: u32, has_sizes: bool) -> Vec<u8> {
     let mut bytes = [*b"MVSI", version.to_le_bytes(), [0; 4]].concat();
     let count = |bytes: &mut Vec<u8>, n: u64| bytes.extend(n.to_le_bytes());
     let floats =
@@ -151,8 +152,10 @@ fn openmvs(version: u32) -> Vec<u8> {
         count(&mut bytes, 3);
         bytes.extend(b"RGB");
     }
-    bytes.extend([16_u32, 12].iter().flat_map(|v| v.to_le_bytes()));
-    floats(&mut bytes, &[20.0, 0.0, 8.0, 0.0, 20.0, 6.0, 0.0, 0.0, 1.0]);
+    let (size, unit) = if has_sizes { ([16_u32, 12], 1.0) } else { ([0, 0], 16.0) };
+    bytes.extend(size.iter().flat_map(|v| v.to_le_bytes()));
+    let matrix = [20.0, 0.0, 8.0, 0.0, 20.0, 6.0].map(|v| v / unit);
+    floats(&mut bytes, &[&matrix[..], &[0.0, 0.0, 1.0]].concat());
     floats(&mut bytes, &identity);
     floats(&mut bytes, &[0.0; 3]);
     count(&mut bytes, 2);
@@ -185,6 +188,20 @@ fn openmvs(version: u32) -> Vec<u8> {
         bytes.extend(1.0_f32.to_le_bytes());
     }
     bytes
+}
+
+#[test]
+fn openmvs_without_sizes_means_the_same() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scenes = scenes(folder.path());
+    let intrinsics = |name: &str| {
+        let (scene, _) = scenes.iter().find(|(scene, _)| scene.ends_with(name)).expect("made");
+        let read = read_scene(scene, &ReadOptions::default()).expect("whole");
+        read.views.values().map(|view| view.camera.intrinsics).collect::<Vec<_>>()
+    };
+    let stated = intrinsics("openmvs 3");
+    assert_eq!((stated[0].width, stated[0].fx, stated[0].cx, stated[0].cy), (16, 20.0, 8.0, 6.0));
+    assert_eq!(intrinsics("openmvs without sizes"), stated);
 }
 
 #[test]

@@ -10,7 +10,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::names::resolve_inside;
 use super::points::PointsInto;
-use super::views::{Candidate, Geometry, admit};
+use super::views::{Candidate, Geometry, Units, admit};
 use super::{ReadError, ReadOptions, ViewError, inconsistent, read_text, relative_name};
 use crate::{CameraError, Distortion, Intrinsics, Pose, Scene, ViewId, Warning, image_size};
 
@@ -164,5 +164,5 @@ fn geometry(
         return Err(CameraError::NotFinite { field: "distortion" }.into());
     }
     let distortion = if (k1, k2) == (0.0, 0.0) { Distortion::None } else { Distortion::Radial { k1, k2 } };
-    Ok(Geometry { pose, intrinsics, has_size: true, distortion, depth_range: None })
+    Ok(Geometry { pose, intrinsics, units: Units::Pixels, distortion, depth_range: None })
 }

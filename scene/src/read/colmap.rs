@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 
 use super::points::PointsInto;
-use super::views::{Candidate, Geometry, admit};
+use super::views::{Candidate, Geometry, Units, admit};
 use super::{ReadError, ReadOptions, ViewError, colmap_binary, colmap_text, inconsistent};
 use crate::{CameraError, Distortion, Intrinsics, Pose, Scene, ViewId, Warning};
 
@@ -164,7 +164,7 @@ fn geometry(image: &RawImage, camera: &RawCamera) -> Result<Geometry, ViewError>
     // COLMAP puts the top-left pixel's centre at (0.5, 0.5).
     let (width, height) = (camera.width, camera.height);
     let intrinsics = Intrinsics { width, height, fx, fy, skew: 0.0, cx: cx - 0.5, cy: cy - 0.5 }.checked()?;
-    Ok(Geometry { pose, intrinsics, has_size: true, distortion, depth_range: None })
+    Ok(Geometry { pose, intrinsics, units: Units::Pixels, distortion, depth_range: None })
 }
 
 /// Focal lengths, principal point and distortion, for the models that are supported.

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use nalgebra::{Matrix3, Vector3};
 
 use super::pairs::parse_pairs;
-use super::views::{Candidate, Geometry, admit};
+use super::views::{Candidate, Geometry, Units, admit};
 use super::{DepthLine, PixelCentre, ReadError, ReadOptions, ViewError, read_text};
 use crate::{Camera, DepthRange, Distortion, Intrinsics, Pose, Scene, SourceScore, ViewId, Warning};
 
@@ -172,8 +172,13 @@ fn parse_camera(text: &str, options: &ReadOptions) -> Result<(Geometry, Option<S
     let range = depth_range(&line, options);
     let warning = (range.is_none() && !line.is_empty())
         .then(|| format!("its depth line {line:?} states no range and was left out"));
-    let geometry =
-        Geometry { pose, intrinsics, has_size: false, distortion: Distortion::None, depth_range: range };
+    let geometry = Geometry {
+        pose,
+        intrinsics,
+        units: Units::PixelsOfImage,
+        distortion: Distortion::None,
+        depth_range: range,
+    };
     Ok((geometry, warning))
 }
 

@@ -11,7 +11,7 @@ use serde_json::{Map, Value};
 
 use super::json::{json_at, number};
 use super::names::resolve_inside;
-use super::views::{Candidate, Geometry, admit};
+use super::views::{Candidate, Geometry, Units, admit};
 use super::{ReadError, ReadOptions, ViewError, inconsistent, relative_name};
 use crate::{Distortion, Intrinsics, Pose, Scene, ViewId, Warning, image_size};
 
@@ -103,7 +103,7 @@ fn geometry(
         let centre = Vector3::new(matrix[0][3], matrix[1][3], matrix[2][3]);
         let rotation = to_world.transpose();
         let pose = Pose::new(rotation, -(rotation * centre))?;
-        Ok(Geometry { pose, intrinsics, has_size: true, distortion, depth_range: None })
+        Ok(Geometry { pose, intrinsics, units: Units::Pixels, distortion, depth_range: None })
     };
     Ok(geometry())
 }

@@ -9,7 +9,7 @@ use serde_json::{Map, Value};
 
 use super::json::{json_at, number, numbers};
 use super::points::PointsInto;
-use super::views::{Candidate, Geometry, admit};
+use super::views::{Candidate, Geometry, Units, admit};
 use super::{ReadError, ReadOptions, ViewError, inconsistent, relative_name};
 use crate::{Distortion, Intrinsics, Pose, Scene, ViewId, Warning};
 
@@ -232,5 +232,5 @@ fn geometry(pose: &Extrinsic, lens: Lens) -> Result<Geometry, ViewError> {
     let (intrinsics, distortion) = lens?;
     let rotation = Matrix3::from_fn(|row, column| pose.rotation[row][column]);
     let pose = Pose::new(rotation, -(rotation * Vector3::from(pose.center)))?;
-    Ok(Geometry { pose, intrinsics, has_size: true, distortion, depth_range: None })
+    Ok(Geometry { pose, intrinsics, units: Units::Pixels, distortion, depth_range: None })
 }

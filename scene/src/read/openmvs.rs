@@ -6,7 +6,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::bytes::Bytes;
 use super::points::PointsInto;
-use super::views::{Candidate, Geometry, admit};
+use super::views::{Candidate, Geometry, Units, admit};
 use super::{ReadError, ReadOptions, ViewError, relative_name};
 use crate::{Distortion, Intrinsics, Pose, Scene, ViewId, Warning};
 
@@ -117,18 +117,20 @@ fn platforms(bytes: &mut Bytes, version: u32) -> Result<Vec<Platform>, ReadError
 
 fn geometry(camera: &Camera, (rotation, centre): &([f64; 9], [f64; 3])) -> Result<Geometry, ViewError> {
     let &Camera { width, height, matrix: [fx, skew, cx, _, fy, cy, ..], .. } = camera;
-    if width == 0 || height == 0 {
-        // Such cameras have a K in units of the image's larger side, which is not known to be tested.
-        return Err(ViewError::UnsupportedModel { model: "of OpenMVS without an image size".to_owned() });
-    }
-    let intrinsics = Intrinsics { width, height, fx, fy, skew, cx, cy }.checked()?;
+    // Without a size, K is in units of the image's larger side, if its centre lies within a few of them.
+    let units = match (width, height) {
+        (1.., 1..) => Units::Pixels,
+        _ if cx < 3.0 && cy < 3.0 => Units::LargerSide,
+        _ => Units::PixelsOfImage,
+    };
+    let intrinsics = Intrinsics { width, height, fx, fy, skew, cx, cy };
     // The camera may stand away from its platform: x = R_c (R_p (X - C_p) - C_c).
     let platform = Matrix3::from_row_slice(rotation);
     let mount = Matrix3::from_row_slice(&camera.rotation);
     let rotation = mount * platform;
     let translation = -(rotation * Vector3::from(*centre)) - mount * Vector3::from(camera.centre);
     let pose = Pose::new(rotation, translation)?;
-    Ok(Geometry { pose, intrinsics, has_size: true, distortion: Distortion::None, depth_range: None })
+    Ok(Geometry { pose, intrinsics, units, distortion: Distortion::None, depth_range: None })
 }
 
 fn points(bytes: &mut Bytes, images: u32, scene: &mut Scene) -> Result<(), ReadError> {

@@ -21,10 +21,20 @@ pub(super) struct Candidate {
 pub(super) struct Geometry {
     pub pose: Pose,
     pub intrinsics: Intrinsics,
-    /// Whether the files state the size in `intrinsics`; otherwise the image does.
-    pub has_size: bool,
+    pub units: Units,
     pub distortion: Distortion,
     pub depth_range: Option<DepthRange>,
+}
+
+/// What intrinsics are counted in.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Units {
+    /// Pixels of an image of the size that they state.
+    Pixels,
+    /// Pixels of the image, whose size the files do not state.
+    PixelsOfImage,
+    /// The larger side of the image, whose size the files do not state.
+    LargerSide,
 }
 
 enum Refusal {
@@ -82,18 +92,25 @@ fn examine(candidate: Candidate, images: &Path) -> Result<(View, Option<Warning>
     let image = locate(images, &name)?;
     let (width, height) = image_size(&image).map_err(|error| Refusal::Skipped(chain(&error)))?;
     let stated = geometry.intrinsics;
-    let (intrinsics, warning) = if geometry.has_size {
-        let (intrinsics, scaled) = fit_to_image(&stated.checked()?, width, height)?;
-        let warning = scaled.then(|| {
-            let what = format!(
-                "view {name:?}: its image is {width}x{height}, its camera {}x{}; the intrinsics were scaled",
-                stated.width, stated.height
-            );
-            Warning::new(what, "nothing, if the image was made smaller or larger as a whole and not cropped")
-        });
-        (intrinsics, warning)
-    } else {
-        (stated.with_size(width, height).checked()?, None)
+    let (intrinsics, warning) = match geometry.units {
+        Units::Pixels => {
+            let (intrinsics, scaled) = fit_to_image(&stated.checked()?, width, height)?;
+            let warning = scaled.then(|| {
+                let what = format!(
+                    "view {name:?}: its image is {width}x{height}, its camera {}x{}; the intrinsics were scaled",
+                    stated.width, stated.height
+                );
+                Warning::new(what, "nothing, if the image was made smaller or larger as a whole and not cropped")
+            });
+            (intrinsics, warning)
+        }
+        Units::PixelsOfImage => (stated.with_size(width, height).checked()?, None),
+        Units::LargerSide => {
+            let side = f64::from(width.max(height));
+            let Intrinsics { fx, fy, skew, cx, cy, .. } = stated;
+            let [fx, fy, skew, cx, cy] = [fx, fy, skew, cx, cy].map(|value| value * side);
+            (Intrinsics { width, height, fx, fy, skew, cx, cy }.checked()?, None)
+        }
     };
     let camera = Camera { intrinsics, pose: geometry.pose };
     let (distortion, depth_range) = (geometry.distortion, geometry.depth_range);
