@@ -114,6 +114,25 @@ fn bands_of_rows_change_no_bit() {
 }
 
 #[test]
+fn a_scene_of_any_format_gives_the_same_cloud() {
+    let bench = of_courtyard();
+    let points = |scene: &str, out: &str| {
+        let options = ["--views", "3", "--depths", "32", "--max-size", "160"];
+        let run = run([&["reconstruct", scene, "-o", out, "--json"], &options[..]].concat());
+        run.expect_code(0).json()["points"].as_f64().expect("a number")
+    };
+    let of_colmap = points(&bench.scene(), &bench.path("colmap"));
+    assert!(of_colmap > 500.0, "{of_colmap} points");
+    for format in ["colmap-text", "openmvg", "mvsnet"] {
+        let [scene, out] = ["scene", "out"].map(|kind| bench.path(&format!("{format}-{kind}")));
+        let _ = run(["convert", &bench.scene(), &scene, "--to", format]).expect_code(0);
+        let of_format = points(&scene, &out);
+        // A camera matrix written as text may have another last digit.
+        assert!((of_format / of_colmap - 1.0).abs() < 0.01, "{format}: {of_format} points, COLMAP {of_colmap}");
+    }
+}
+
+#[test]
 fn a_second_run_does_nothing_again_and_a_changed_option_only_what_it_changes() {
     let bench = of_courtyard();
     // Four views, three jobs each, and the cloud: progress is shown whenever one of them runs.
