@@ -4,8 +4,14 @@ use std::error::Error;
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-changed=proto");
-    let contracts = ["planesweep/v1/coordinator.proto", "planesweep/v1/exchange.proto"];
+    let contracts = ["coordinator", "blobs", "exchange"].map(|name| format!("planesweep/v1/{name}.proto"));
     let files = protox::compile(contracts, ["proto"])?;
-    tonic_prost_build::configure().btree_map(".").bytes(".planesweep.v1.FetchChunk").compile_fds(files)?;
+    // What carries the bytes of blobs copies none.
+    tonic_prost_build::configure()
+        .btree_map(".")
+        .bytes(".planesweep.v1.FetchChunk")
+        .bytes(".planesweep.v1.ReadChunk")
+        .bytes(".planesweep.v1.WriteChunk.data")
+        .compile_fds(files)?;
     Ok(())
 }

@@ -79,10 +79,8 @@ impl Computation<'_> {
         let mut lost = Vec::new();
         for result in results {
             let Some((key, _)) = &result.blob else { continue };
-            match self.store.get(key).await {
-                Ok(_) => {}
-                Err(error) if error.is_lost() => lost.push(result.job),
-                Err(error) => return Err(error).context("cannot read the store"),
+            if !self.store.holds(key).await.context("cannot read the store")? {
+                lost.push(result.job);
             }
         }
         Ok(lost)

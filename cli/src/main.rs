@@ -9,6 +9,7 @@ mod computation;
 mod console;
 mod depth_maps;
 mod forecast;
+mod host;
 mod input;
 mod interrupts;
 mod network;
@@ -17,6 +18,7 @@ mod prepare;
 mod run_record;
 mod supervisor;
 mod training;
+mod upload;
 mod workspace;
 
 use std::io::{Write, stdout};

@@ -3,6 +3,7 @@
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
+use planesweep_store::Objects;
 use thiserror::Error;
 use tonic::metadata::{Ascii, MetadataValue};
 
@@ -13,8 +14,17 @@ const MIN_LEASE: Duration = Duration::from_millis(100);
 /// Longer leases would leave a dead worker's jobs undone for an hour and more.
 const MAX_LEASE: Duration = Duration::from_hours(1);
 
+/// A store whose blobs the coordinator passes on.
+#[derive(Clone, Debug)]
+pub struct ServedStore {
+    /// The store.
+    pub store: Objects,
+    /// What tells it from all others.
+    pub identity: String,
+}
+
 /// What a coordinator is started with.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug)]
 pub struct Config {
     /// What knows every job.
     pub ledger: LedgerPlace,
@@ -25,6 +35,8 @@ pub struct Config {
     pub lease: Duration,
     /// Where blobs lie; told to the workers.
     pub store_url: String,
+    /// The same store, for callers that do not reach it at its address; `None` when all do.
+    pub served: Option<ServedStore>,
     /// What callers must show; needed when listening to other hosts.
     pub token: Option<String>,
 }
@@ -59,6 +71,7 @@ impl Config {
             listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0),
             lease: Duration::from_secs(7),
             store_url: store_url.into(),
+            served: None,
             token: None,
         }
     }

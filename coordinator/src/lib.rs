@@ -18,6 +18,6 @@ pub mod schedule;
 mod server;
 mod service;
 
-pub use config::{Config, ConfigError};
+pub use config::{Config, ConfigError, ServedStore};
 pub use ledger::{Ledger, LedgerError, LedgerPlace};
 pub use server::{Coordinator, Handle, StartError};

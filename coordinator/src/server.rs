@@ -8,7 +8,7 @@ use std::time::Duration;
 use planesweep_plan::{Job, JobId, RunId};
 use planesweep_proto::wire::coordinator_server::CoordinatorServer;
 use planesweep_proto::{
-    CheckToken, JobResult, Order, RunStatus, ServiceError, SubmitHeader, Submitted, check_jobs,
+    CheckToken, JobResult, Order, RunStatus, ServiceError, StorePlace, SubmitHeader, Submitted, check_jobs,
 };
 use thiserror::Error;
 use tokio::net::TcpListener;
@@ -21,7 +21,7 @@ use tonic::transport::server::TcpIncoming;
 use crate::config::{Config, ConfigError};
 use crate::driver::{Driver, DriverHandle, Message, Settings};
 use crate::ledger::{Ledger, LedgerError};
-use crate::service::{Service, refusal};
+use crate::service::{BlobService, Service, refusal};
 
 /// How often a connection is probed, and how long the answer may take.
 const KEEP_ALIVE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(5));
@@ -63,14 +63,15 @@ impl Coordinator {
             listener.local_addr().map_err(|source| StartError::Listen { listen: config.listen, source })?;
         let ledger = Arc::new(Ledger::open(&config.ledger).await?);
         let closed = CancellationToken::new();
-        let settings = Settings {
-            lease: config.lease,
-            report_interval: config.report_interval(),
-            store_url: config.store_url.clone(),
-        };
+        let identity = config.served.as_ref().map(|served| served.identity.clone());
+        let store = StorePlace { url: config.store_url.clone(), identity };
+        let settings =
+            Settings { lease: config.lease, report_interval: config.report_interval(), store: store.clone() };
         let (driver, driver_task) = Driver::start(ledger.clone(), settings, closed.clone()).await?;
-        let service = Service { driver, ledger, store_url: config.store_url.clone() };
-        let server = InterceptedService::new(service.clone().into_server(), CheckToken(token));
+        let service = Service { driver, ledger, store };
+        let server = InterceptedService::new(service.clone().into_server(), CheckToken(token.clone()));
+        let blobs = config.served.as_ref().map(|served| BlobService::server(served.store.clone()));
+        let blobs = blobs.map(|blobs| InterceptedService::new(blobs, CheckToken(token)));
         let (health, health_service) = tonic_health::server::health_reporter();
         health.set_serving::<CoordinatorServer<Service>>().await;
         let stop = CancellationToken::new();
@@ -82,6 +83,7 @@ impl Coordinator {
                 .http2_keepalive_timeout(Some(KEEP_ALIVE.1))
                 .add_service(health_service)
                 .add_service(server)
+                .add_optional_service(blobs)
                 .serve_with_incoming_shutdown(TcpIncoming::from(listener).with_nodelay(Some(true)), stopped),
         );
         Ok(Handle {

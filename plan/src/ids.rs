@@ -72,6 +72,22 @@ impl BlobKey {
     }
 }
 
+/// The key of bytes that come in pieces.
+#[derive(Clone, Debug, Default)]
+pub struct BlobHasher(blake3::Hasher);
+
+impl BlobHasher {
+    /// Adds the next piece.
+    pub fn update(&mut self, bytes: &[u8]) {
+        self.0.update(bytes);
+    }
+
+    /// The key of all pieces so far.
+    pub fn key(&self) -> BlobKey {
+        BlobKey(*self.0.finalize().as_bytes())
+    }
+}
+
 fn parse_hex(text: &str) -> Option<[u8; 32]> {
     if text.len() != 64 || !text.is_ascii() {
         return None;
@@ -120,6 +136,15 @@ impl fmt::Display for WorkerId {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn pieces_have_the_key_of_the_whole() {
+        let mut hasher = BlobHasher::default();
+        assert_eq!(hasher.key(), BlobKey::of(b""));
+        hasher.update(b"by");
+        hasher.update(b"tes");
+        assert_eq!(hasher.key(), BlobKey::of(b"bytes"));
+    }
 
     #[test]
     fn hashes_survive_text() {

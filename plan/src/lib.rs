@@ -23,7 +23,7 @@ mod views;
 
 pub use checkup::{Finding, Severity, checkup, sparse_depths};
 pub use depth_range::{DEPTH_MULTIPLE, MIN_POINTS};
-pub use ids::{Attempt, BlobKey, JobId, ParseHashError, RunId, WorkerId};
+pub use ids::{Attempt, BlobHasher, BlobKey, JobId, ParseHashError, RunId, WorkerId};
 pub use job::{
     AssembleSpec, EmitSpec, FilterSpec, FitSpec, ImageSpec, InferSpec, Job, JobSpec, MaskSpec,
     NUMERICS_VERSION, StitchSpec,

@@ -13,8 +13,8 @@ use tonic::{Request, Status};
 use crate::limits::{MAX_MESSAGE_BYTES, SUBMIT_CHUNK_BYTES};
 use crate::wire::coordinator_client::CoordinatorClient;
 use crate::{
-    CODE_VERSION, Code, JobResult, PROTOCOL_VERSION, Report, ReportReply, RunStatus, RunSummary,
-    ServiceError, SubmitHeader, Submitted, check_jobs, wire,
+    BlobClient, CODE_VERSION, Code, JobResult, PROTOCOL_VERSION, Report, ReportReply, RunStatus, RunSummary,
+    ServiceError, StorePlace, SubmitHeader, Submitted, check_jobs, wire,
 };
 
 /// The metadata key that carries the token.
@@ -61,6 +61,7 @@ type Stub = CoordinatorClient<InterceptedService<Channel, WithToken>>;
 #[derive(Clone)]
 pub struct Client {
     stub: Stub,
+    blobs: BlobClient,
 }
 
 impl Client {
@@ -77,10 +78,11 @@ impl Client {
             .http2_keep_alive_interval(KEEP_ALIVE.0)
             .keep_alive_timeout(KEEP_ALIVE.1)
             .keep_alive_while_idle(true);
+        let blobs = BlobClient::new(&endpoint, WithToken(token.clone()));
         let stub = CoordinatorClient::with_interceptor(endpoint.connect_lazy(), WithToken(token))
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
-        Ok(Self { stub })
+        Ok(Self { stub, blobs })
     }
 
     /// Reports, and learns what to do next. Dropping the future before it ends is safe: what it
@@ -101,14 +103,20 @@ impl Client {
         Ok(self.stub.submit(tokio_stream::iter(chunks)).await?.into_inner().try_into()?)
     }
 
+    /// The store, through the coordinator, over a connection of its own: a large blob does not hold up
+    /// reports.
+    pub fn blobs(&self) -> BlobClient {
+        self.blobs.clone()
+    }
+
     /// Where the coordinator's results lie; an error when it is of another version.
-    pub async fn store_url(&mut self) -> Result<String, ServiceError> {
+    pub async fn store(&mut self) -> Result<StorePlace, ServiceError> {
         let request = wire::DescribeRequest {
             protocol_version: PROTOCOL_VERSION,
             code_version: CODE_VERSION.to_owned(),
             numerics_version: NUMERICS_VERSION,
         };
-        Ok(self.stub.describe(request).await?.into_inner().store_url)
+        Ok(self.stub.describe(request).await?.into_inner().try_into()?)
     }
 
     /// The latest runs, newest first.

@@ -1,7 +1,7 @@
 //! The wire: the gRPC contract and its checked conversion to and from domain types.
 //!
-//! `proto/planesweep/v1/coordinator.proto` is the contract with the coordinator, `exchange.proto` that of
-//! workers among themselves. [`wire`] is what the compiler makes of
+//! `proto/planesweep/v1/coordinator.proto` is the contract with the coordinator, `blobs.proto` what it
+//! passes on of the store, `exchange.proto` that of workers among themselves. [`wire`] is what the compiler makes of
 //! it; only `convert` and the server's handlers touch it. Everybody else speaks in the types of
 //! this page and in those of `plan`, which cannot hold what was not checked: finite numbers, true
 //! rotations, hashes of the right length, counts and names within [`limits`].
@@ -19,6 +19,7 @@
 
 #![warn(missing_docs)]
 
+mod blobs;
 mod client;
 mod convert;
 mod error;
@@ -29,17 +30,18 @@ mod run;
 mod token;
 mod way;
 
+pub use blobs::BlobClient;
 pub use client::{Client, TOKEN_HEADER, bearer};
 pub use convert::{WireError, check_job, check_jobs, decode_job, encode_job};
 pub use error::{Code, ServiceError};
 pub use peer::PeerClient;
 pub use report::{
     Endpoint, Failure, FinishedJob, Grant, HeldJob, Input, JobAttempt, Order, Outcome, Peer, Produced,
-    Report, ReportReply, Role, Slots, Success, WorkerState,
+    Report, ReportReply, Role, Slots, StorePlace, Success, WorkerState,
 };
 pub use run::{JobResult, JobState, RunStatus, RunSummary, SubmitHeader, Submitted, WorkerStatus};
 pub use token::CheckToken;
-pub use way::{Way, maps_by_way};
+pub use way::{IMAGES_FETCHED, Way, images_fetched, maps_by_way};
 
 /// Raised when a message changes its meaning; two sides with different numbers refuse each other.
 pub const PROTOCOL_VERSION: u32 = 1;

@@ -23,9 +23,11 @@ pub const MAX_SLOTS: u32 = 256;
 pub const MAX_REPORTED: usize = 10_000;
 /// Other workers that one is told of at once.
 pub const MAX_PEERS: usize = 10_000;
-/// Bytes of a blob in one chunk on its way between workers.
+/// Bytes of a blob. The largest honest one is the cloud, 15 bytes for each point.
+pub const MAX_BLOB_BYTES: u64 = 1 << 40;
+/// Bytes of a blob in one chunk on its way between workers, or through the coordinator.
 pub const FETCH_CHUNK_BYTES: usize = 256 << 10;
-/// Bytes of one message between workers: a chunk and its frame.
+/// Bytes of one message with such a chunk: the chunk and its frame.
 pub const MAX_EXCHANGE_MESSAGE_BYTES: usize = FETCH_CHUNK_BYTES + 1024;
 /// Bytes of the name of a worker, host, run, device, failure code or measurement.
 pub const MAX_NAME_BYTES: usize = 255;

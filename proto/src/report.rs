@@ -188,11 +188,21 @@ pub struct ReportReply {
     /// Ended jobs that it may forget.
     pub acknowledged: Vec<JobAttempt>,
     /// Where blobs lie.
-    pub store_url: String,
+    pub store: StorePlace,
     /// Whether to go on.
     pub order: Order,
     /// The workers that made what the grants need, and those of the same host with an inbox.
     pub peers: Vec<Peer>,
+}
+
+/// Where blobs lie, as the coordinator sees it.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct StorePlace {
+    /// The store's address.
+    pub url: String,
+    /// What the store says of itself: who finds something else at the address does not see the store.
+    /// `None` when all do.
+    pub identity: Option<String>,
 }
 
 /// Another worker, and the ways on which this one can reach it.

@@ -1,4 +1,4 @@
-//! The ways on which a finished map reaches the job that needs it.
+//! The ways on which finished maps, and photographs, reach the jobs that need them.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -42,6 +42,15 @@ impl fmt::Display for Way {
             Self::Store => "from the store",
         })
     }
+}
+
+/// The measurement of a job that counts the photographs and masks that the store had to send, for they were
+/// neither under their path nor on the worker's disk.
+pub const IMAGES_FETCHED: &str = "images_fetched";
+
+/// How many photographs and masks the store had to send, over these jobs.
+pub fn images_fetched<'a>(results: impl IntoIterator<Item = &'a JobResult>) -> u64 {
+    results.into_iter().filter_map(|result| result.measurements.get(IMAGES_FETCHED)).map(|n| *n as u64).sum()
 }
 
 /// How many maps came on each way, over these jobs.

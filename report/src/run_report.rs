@@ -27,6 +27,9 @@ pub struct RunReport {
     /// How many maps came to the jobs that needed them on each way, by the way's name.
     #[serde(default)]
     pub maps_by_way: BTreeMap<String, u64>,
+    /// How many photographs and masks the store had to send to workers that did not have them.
+    #[serde(default)]
+    pub images_fetched: u64,
     /// Sums.
     pub totals: Totals,
 }
@@ -193,6 +196,7 @@ pub(crate) mod tests {
             }],
             warnings: vec!["3 points have no track".into()],
             maps_by_way: BTreeMap::from([("in process".into(), 11), ("by shared memory".into(), 3)]),
+            images_fetched: 4,
             totals: Totals { points: 54_600, wall_seconds: 143.5 },
         }
     }

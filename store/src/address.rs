@@ -27,17 +27,27 @@ macro_rules! built {
     }};
 }
 
-/// Opens what lies at an address. A local folder is made if it is not there.
+/// What to do when a local folder is not there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum IfAbsent {
+    Make,
+    Refuse,
+}
+
+/// Opens what lies at an address.
 ///
 /// `variables` say the endpoint, region and keys of an object store, under the names that the tools of each
 /// provider use.
 pub(crate) fn open(
     url: &str,
     variables: impl IntoIterator<Item = (String, String)>,
+    if_absent: IfAbsent,
 ) -> Result<Arc<dyn ObjectStore>, StoreError> {
     let error = |problem: String| StoreError::Open { url: url.to_owned(), problem };
     if let Some(folder) = url.strip_prefix("file://").map(PathBuf::from) {
-        std::fs::create_dir_all(&folder).map_err(|e| error(e.to_string()))?;
+        if if_absent == IfAbsent::Make {
+            std::fs::create_dir_all(&folder).map_err(|e| error(e.to_string()))?;
+        }
         let local = LocalFileSystem::new_with_prefix(&folder).map_err(|e| error(e.to_string()))?;
         return Ok(Arc::new(local.with_fsync(true)));
     }

@@ -1,45 +1,68 @@
-//! Writing, reading and checking blobs.
+//! Writing, reading and checking blobs, wherever they lie.
 
-use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
-use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt, WriteMultipart};
 use planesweep_plan::BlobKey;
+use planesweep_proto::{BlobClient, Client, Code, ServiceError, StorePlace};
 use tokio_util::sync::CancellationToken;
 
 use crate::patience::patiently;
-use crate::{StoreError, address};
+use crate::{Objects, StoreError};
 
-/// Larger blobs go to object stores in parts of this size, some at a time.
-const PART_BYTES: usize = 8 << 20;
-const PARTS_AT_A_TIME: usize = 4;
+/// How long a store may take to say who it is: one that cannot be reached says nothing.
+const LOOK: Duration = Duration::from_secs(10);
 
 /// A store of blobs; clones share it.
 #[derive(Clone, Debug)]
 pub struct Store {
-    objects: Arc<dyn ObjectStore>,
-    url: String,
+    place: Place,
     /// Ends the waiting for a store in trouble.
     impatience: CancellationToken,
 }
 
+#[derive(Clone, Debug)]
+enum Place {
+    /// Reached from here.
+    Objects(Objects),
+    /// Reached by the coordinator, which passes the bytes on.
+    Coordinator { client: BlobClient, url: String },
+}
+
+impl From<Objects> for Store {
+    fn from(objects: Objects) -> Self {
+        Self::at(Place::Objects(objects))
+    }
+}
+
 impl Store {
-    /// Opens the store in a local folder, `file:///...`, which is made if it is not there, or in an object
-    /// store, `s3://bucket/prefix` (also `gs://`, `az://`), whose endpoint and keys are in the environment
-    /// as the provider's own tools have them (`AWS_ENDPOINT_URL`, `AWS_ACCESS_KEY_ID`, ...).
+    /// Opens a store that is reached from here, as [`Objects::open`] does.
     pub fn open(url: &str) -> Result<Self, StoreError> {
-        Self::open_with(url, std::env::vars())
+        Objects::open(url).map(Self::from)
     }
 
-    /// The same with other variables than those of the environment.
-    pub fn open_with(
-        url: &str,
-        variables: impl IntoIterator<Item = (String, String)>,
-    ) -> Result<Self, StoreError> {
+    /// The store of a coordinator: that at its address if it is seen from here, else through the
+    /// coordinator.
+    pub async fn of(client: &Client, told: &StorePlace) -> Result<Self, StoreError> {
+        let Some(identity) = &told.identity else { return Self::open(&told.url) };
+        let why = match tokio::time::timeout(LOOK, Objects::find(&told.url, identity)).await {
+            Ok(Ok(objects)) => return Ok(objects.into()),
+            Ok(Err(error)) => error.to_string(),
+            Err(_) => format!("the store at {} does not answer", told.url),
+        };
+        tracing::warn!("{why}; its blobs go through the coordinator");
+        Ok(Self::at(Place::Coordinator { client: client.blobs(), url: told.url.clone() }))
+    }
+
+    /// Whether bytes go to the store and come from it without the coordinator.
+    pub fn is_reached_from_here(&self) -> bool {
+        matches!(self.place, Place::Objects(_))
+    }
+
+    fn at(place: Place) -> Self {
         let impatience = CancellationToken::new();
         impatience.cancel();
-        Ok(Self { objects: address::open(url, variables)?, url: url.to_owned(), impatience })
+        Self { place, impatience }
     }
 
     /// The same store, which waits while it cannot be reached or has no room, until `impatience` is
@@ -51,7 +74,10 @@ impl Store {
 
     /// The store's address.
     pub fn url(&self) -> &str {
-        &self.url
+        match &self.place {
+            Place::Objects(objects) => objects.url(),
+            Place::Coordinator { url, .. } => url,
+        }
     }
 
     /// Writes a blob, unless it is there already, and returns its key.
@@ -62,35 +88,13 @@ impl Store {
     }
 
     async fn try_put(&self, key: BlobKey, bytes: Bytes) -> Result<(), StoreError> {
-        let path = path_of(&key);
-        if self.objects.head(&path).await.is_ok_and(|found| found.size == bytes.len() as u64) {
-            // Of the right length, but perhaps damaged: only then it is written again.
-            if self.try_get(key).await.is_ok() {
-                return Ok(());
+        match &self.place {
+            Place::Objects(objects) => objects.put(key, bytes).await,
+            Place::Coordinator { .. } if self.try_holds(key).await? => Ok(()),
+            Place::Coordinator { client, .. } => {
+                client.clone().write(&key, bytes).await.map_err(|source| not_passed_on(key, source))
             }
         }
-        let written = self.write(&path, bytes).await;
-        written.map_err(|source| StoreError::Write { key, url: self.url.clone(), source })
-    }
-
-    async fn write(&self, path: &Path, bytes: Bytes) -> object_store::Result<()> {
-        // A file is written at once, whatever its size.
-        if bytes.len() <= 2 * PART_BYTES || self.url.starts_with("file://") {
-            self.objects.put(path, bytes.into()).await?;
-            return Ok(());
-        }
-        let upload = self.objects.put_multipart(path).await?;
-        let mut parts = WriteMultipart::new_with_chunk_size(upload, PART_BYTES);
-        for start in (0..bytes.len()).step_by(PART_BYTES) {
-            if let Err(error) = parts.wait_for_capacity(PARTS_AT_A_TIME).await {
-                // What was sent stays hidden, but costs room until it is told to go.
-                let _ = parts.abort().await;
-                return Err(error);
-            }
-            parts.put(bytes.slice(start..bytes.len().min(start + PART_BYTES)));
-        }
-        parts.finish().await?;
-        Ok(())
     }
 
     /// Reads a blob and checks its hash.
@@ -99,30 +103,33 @@ impl Store {
     }
 
     async fn try_get(&self, key: BlobKey) -> Result<Bytes, StoreError> {
-        let read = async { self.objects.get(&path_of(&key)).await?.bytes().await };
-        let bytes = read.await.map_err(|source| match source {
-            object_store::Error::NotFound { .. } => StoreError::Missing { key },
-            source => StoreError::Read { key, url: self.url.clone(), source },
-        })?;
-        if BlobKey::of(&bytes) == key { Ok(bytes) } else { Err(StoreError::Damaged { key }) }
+        match &self.place {
+            Place::Objects(objects) => objects.get(key).await,
+            Place::Coordinator { client, .. } => {
+                let bytes = client.clone().read(&key).await.map_err(|source| not_passed_on(key, source))?;
+                if BlobKey::of(&bytes) == key { Ok(bytes) } else { Err(StoreError::Damaged { key }) }
+            }
+        }
     }
 
-    /// Whether a blob of this length is there; its hash is not checked.
-    pub async fn has(&self, key: &BlobKey, length: u64) -> Result<bool, StoreError> {
-        patiently(&self.impatience, || self.ask(*key, length)).await
+    /// Whether a blob is there with all its bytes, which are read and hashed where the store is reached.
+    pub async fn holds(&self, key: &BlobKey) -> Result<bool, StoreError> {
+        patiently(&self.impatience, || self.try_holds(*key)).await
     }
 
-    async fn ask(&self, key: BlobKey, length: u64) -> Result<bool, StoreError> {
-        match self.objects.head(&path_of(&key)).await {
-            Ok(found) => Ok(found.size == length),
-            Err(object_store::Error::NotFound { .. }) => Ok(false),
-            Err(source) => Err(StoreError::Read { key, url: self.url.clone(), source }),
+    async fn try_holds(&self, key: BlobKey) -> Result<bool, StoreError> {
+        match &self.place {
+            Place::Objects(objects) => objects.holds(key).await,
+            Place::Coordinator { client, .. } => {
+                client.clone().find(&key).await.map_err(|source| not_passed_on(key, source))
+            }
         }
     }
 }
 
-/// Blobs are spread over 256 folders, so that no folder grows without bound.
-fn path_of(key: &BlobKey) -> Path {
-    let name = key.to_string();
-    Path::from(format!("blobs/{}/{}", &name[..2], &name[2..]))
+fn not_passed_on(key: BlobKey, source: ServiceError) -> StoreError {
+    match source.code {
+        Code::NotFound => StoreError::Missing { key },
+        _ => StoreError::Coordinator { key, source },
+    }
 }

@@ -3,6 +3,7 @@
 use std::io::{self, ErrorKind};
 
 use planesweep_plan::BlobKey;
+use planesweep_proto::ServiceError;
 use thiserror::Error;
 
 /// Why a blob could not be written or read.
@@ -38,6 +39,21 @@ pub enum StoreError {
         #[source]
         source: object_store::Error,
     },
+    /// The coordinator did not pass a blob on.
+    #[error("blob {key} does not pass through the coordinator")]
+    Coordinator {
+        /// The blob.
+        key: BlobKey,
+        /// What the coordinator said.
+        #[source]
+        source: ServiceError,
+    },
+    /// A blob was not written, for its bytes were not those of its key.
+    #[error("blob {key} was sent with another hash or length")]
+    Refused {
+        /// The blob.
+        key: BlobKey,
+    },
     /// The store has no such blob.
     #[error("blob {key} is not in the store")]
     Missing {
@@ -61,7 +77,11 @@ impl StoreError {
     /// Whether the same call may succeed later: the store cannot be reached, or has no room. Keys that
     /// open nothing and folders that may not be written are for a person to mend.
     pub fn is_passing(&self) -> bool {
-        let (Self::Write { source, .. } | Self::Read { source, .. }) = self else { return false };
+        let source = match self {
+            Self::Write { source, .. } | Self::Read { source, .. } => source,
+            Self::Coordinator { source, .. } => return source.is_retryable(),
+            _ => return false,
+        };
         let is_forbidden = |kind| matches!(kind, ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem);
         matches!(source, object_store::Error::Generic { .. } | object_store::Error::JoinError { .. })
             && !self.io_kind().is_some_and(is_forbidden)
@@ -83,4 +103,16 @@ impl StoreError {
         }
         None
     }
+}
+
+/// An error with what caused it, outermost first.
+pub(crate) fn with_causes(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(inner) = cause {
+        text.push_str(": ");
+        text.push_str(&inner.to_string());
+        cause = inner.source();
+    }
+    text
 }

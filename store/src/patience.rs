@@ -5,6 +5,7 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
 use crate::StoreError;
+use crate::error::with_causes;
 
 /// Pauses between tries: doubled up to the longest.
 const PAUSES: (Duration, Duration) = (Duration::from_millis(200), Duration::from_secs(5));
@@ -41,16 +42,4 @@ pub(crate) async fn patiently<T, F: Future<Output = Result<T, StoreError>>>(
         }
         pause = (2 * pause).min(PAUSES.1);
     }
-}
-
-/// An error with what caused it, outermost first.
-fn with_causes(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(inner) = cause {
-        text.push_str(": ");
-        text.push_str(&inner.to_string());
-        cause = inner.source();
-    }
-    text
 }

@@ -71,6 +71,12 @@ impl Bench {
         Running::start(self.arguments("submit", out, &[&["--coordinator", url], more].concat()))
     }
 
+    /// The same by a shell script, which has the program in `"$0" "$@"`.
+    pub fn submit_in_script(&self, script: &str, out: &str, url: &str, more: &[&str]) -> Running {
+        let more = [&["--coordinator", url], more].concat();
+        Running::start_in_script(script, self.arguments("submit", out, &more))
+    }
+
     fn arguments(&self, command: &str, out: &str, more: &[&str]) -> Vec<String> {
         let (scene, out, weights) = (self.scene(), self.path(out), self.weights());
         let given = [command, &scene, "-o", &out, "--weights", &weights, "--json"];

@@ -1,10 +1,11 @@
 //! Maps on their way between the processes of real runs, and what happens when shared memory fails: the
 //! cloud stays the same bytes, and the report tells how the maps came.
 
-use std::process::Command;
 use std::time::Duration;
 
-use planesweep_tests::{Bench, Finished, Running, children, courtyard, is_alive, send, wait_until};
+use planesweep_tests::{
+    Bench, Finished, Running, can_mount, children, courtyard, is_alive, send, wait_until,
+};
 
 /// How long a state may take to come; far above what it ever takes.
 const DEADLINE: Duration = Duration::from_mins(5);
@@ -28,16 +29,6 @@ fn maps(run: &Finished, way: &str) -> u64 {
 fn same_cloud(bench: &Bench, one: &str, other: &str) {
     let read = |out: &str| bench.read(&format!("{out}/cloud.ply"));
     assert!(read(one).len() > 10_000 && read(one) == read(other), "{one} and {other} differ");
-}
-
-/// Whether a file system can be mounted for one process alone.
-fn can_mount(test: &str) -> bool {
-    let tried = Command::new("unshare").args(["-m", "mount", "-t", "tmpfs", "tmpfs", "/dev/shm"]).output();
-    let can = tried.is_ok_and(|tried| tried.status.success());
-    if !can {
-        eprintln!("SKIPPED {test}: shared memory of one's own needs root");
-    }
-    can
 }
 
 /// Runs with a shared memory of its own, mounted with these options.

@@ -5,19 +5,21 @@
 //! learns of a job at once. Jobs run as tasks and tell the loop when they begin and end.
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use planesweep_plan::{NUMERICS_VERSION, WorkerId};
 use planesweep_proto::{
     CODE_VERSION, Client, Failure, Grant, JobAttempt, Order, Outcome, PROTOCOL_VERSION, Report, ReportReply,
-    Role, ServiceError, Slots, WorkerState,
+    Role, ServiceError, Slots, StorePlace, WorkerState,
 };
 use thiserror::Error;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use crate::device::{BackendFactory, Device};
+use crate::disk_cache::DiskCache;
 use crate::exchange::{Exchange, ExchangeConfig, ExchangeError};
 use crate::failure::JobError;
 use crate::held::Held;
@@ -52,6 +54,8 @@ pub struct WorkerConfig {
     pub slots: Slots,
     /// Budget of images in memory, of depth maps, of filtered ones, and of maps in shared memory, each.
     pub cache_bytes: u64,
+    /// Where photographs and masks are kept that come from the store, and how many bytes of them.
+    pub disk_cache: (PathBuf, u64),
     /// How it exchanges maps with other workers.
     pub exchange: ExchangeConfig,
     /// Makes the network.
@@ -94,6 +98,7 @@ pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result
         .map_err(|source| WorkerError::Refused { url: config.coordinator.clone(), source })?;
     let device = Device::start(config.backend).map_err(WorkerError::Device)?;
     let maps = Arc::new(Maps::new(config.cache_bytes));
+    let disk_cache = DiskCache::new(config.disk_cache.0, config.disk_cache.1);
     let exchange = Exchange::start(
         &config.exchange,
         &config.id,
@@ -123,7 +128,8 @@ pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result
         events,
         exchange: Arc::new(exchange),
         jobs: None,
-        unopened: Some((device, maps, config.cache_bytes)),
+        is_opening: false,
+        unopened: Some(Unopened { device, maps, cache_bytes: config.cache_bytes, disk_cache }),
         max_wait: FIRST_WAIT,
         lease_ends: None,
         broken: None,
@@ -141,7 +147,17 @@ struct Identity {
     device: String,
 }
 
+/// What the jobs are going to be made of.
+struct Unopened {
+    device: Device,
+    maps: Arc<Maps>,
+    cache_bytes: u64,
+    disk_cache: DiskCache,
+}
+
 enum Event {
+    /// The store was found, or cannot be.
+    Opened(Result<Store, StoreError>),
     Started(JobAttempt),
     Finished(JobAttempt, Outcome),
     /// The job ended for the device is out of order.
@@ -159,9 +175,10 @@ struct Agent {
     tasks: BTreeMap<JobAttempt, CancellationToken>,
     events: mpsc::Sender<Event>,
     exchange: Arc<Exchange>,
-    /// Made with the first reply, which says where the store is.
+    /// Made when the store is found, of which the first reply tells.
     jobs: Option<Arc<Jobs>>,
-    unopened: Option<(Device, Arc<Maps>, u64)>,
+    is_opening: bool,
+    unopened: Option<Unopened>,
     max_wait: Duration,
     lease_ends: Option<Instant>,
     /// Why the device can do no further job.
@@ -188,9 +205,9 @@ impl Agent {
                 biased;
                 // A job that ends is reported at once; the report under way is dropped for it.
                 Some(event) = inbox.recv() => {
-                    self.note(event);
+                    self.note(event)?;
                     while let Ok(event) = inbox.try_recv() {
-                        self.note(event);
+                        self.note(event)?;
                     }
                     continue;
                 }
@@ -202,7 +219,7 @@ impl Agent {
                     reconnect = RECONNECT.0;
                     self.lease_ends = Some(sent + reply.lease);
                     let order = reply.order;
-                    let brought_something = self.apply(reply)?;
+                    let brought_something = self.apply(reply);
                     if order == Order::Stop || self.state == WorkerState::Drained {
                         return Ok(());
                     }
@@ -215,9 +232,9 @@ impl Agent {
                     }
                     if self.state != WorkerState::Ready {
                         // The coordinator holds no reply back for a worker that takes no jobs.
-                        pause(self.max_wait.max(SHORTEST_PAUSE), &mut inbox, &mut self).await;
+                        pause(self.max_wait.max(SHORTEST_PAUSE), &mut inbox, &mut self).await?;
                     } else if !brought_something && sent.elapsed() < SHORTEST_PAUSE {
-                        pause(SHORTEST_PAUSE, &mut inbox, &mut self).await;
+                        pause(SHORTEST_PAUSE, &mut inbox, &mut self).await?;
                     }
                 }
                 Err(error) if error.is_retryable() => {
@@ -227,7 +244,7 @@ impl Agent {
                         // Nobody takes what it still computes; the lease gives the job to another.
                         return Ok(());
                     }
-                    pause(reconnect, &mut inbox, &mut self).await;
+                    pause(reconnect, &mut inbox, &mut self).await?;
                     reconnect = (2 * reconnect).min(RECONNECT.1);
                 }
                 Err(source) => {
@@ -263,14 +280,20 @@ impl Agent {
         }
     }
 
+    /// Opens the store, which may take longer than a lease lasts when it does not answer.
+    fn open(&self, place: StorePlace) {
+        let (client, events) = (self.client.clone(), self.events.clone());
+        tokio::spawn(async move {
+            let opened = Store::of(&client, &place).await;
+            let _ = events.send(Event::Opened(opened)).await;
+        });
+    }
+
     /// Does what a reply says; whether it said anything.
-    fn apply(&mut self, reply: ReportReply) -> Result<bool, WorkerError> {
-        let first = self.unopened.take();
-        let is_first = first.is_some();
-        if let Some((device, maps, cache_bytes)) = first {
-            let store = Store::open(&reply.store_url)?.patient(self.impatience.clone());
-            let exchange = Arc::clone(&self.exchange);
-            self.jobs = Some(Arc::new(Jobs::new(store, device, cache_bytes, maps, exchange)));
+    fn apply(&mut self, reply: ReportReply) -> bool {
+        if !self.is_opening {
+            self.is_opening = true;
+            self.open(reply.store);
         }
         self.exchange.learn(&reply.peers);
         self.max_wait = reply.report_interval;
@@ -278,13 +301,13 @@ impl Agent {
             self.give_up(*attempt);
         }
         self.held.forget(reply.acknowledged.iter().chain(&reply.revoked));
-        let brought_something = is_first || !reply.grants.is_empty() || !reply.acknowledged.is_empty();
+        let brought_something = !reply.grants.is_empty() || !reply.acknowledged.is_empty();
         for grant in reply.grants {
             if self.held.take(&grant) {
                 self.begin(grant);
             }
         }
-        Ok(brought_something)
+        brought_something
     }
 
     fn begin(&mut self, grant: Grant) {
@@ -324,8 +347,16 @@ impl Agent {
         });
     }
 
-    fn note(&mut self, event: Event) {
+    fn note(&mut self, event: Event) -> Result<(), WorkerError> {
         match event {
+            Event::Opened(store) => {
+                let store = store?.patient(self.impatience.clone());
+                if let Some(Unopened { device, maps, cache_bytes, disk_cache }) = self.unopened.take() {
+                    let exchange = Arc::clone(&self.exchange);
+                    let jobs = Jobs::new(store, device, cache_bytes, disk_cache, maps, exchange);
+                    self.jobs = Some(Arc::new(jobs));
+                }
+            }
             Event::Started(attempt) => self.held.start(attempt),
             Event::Finished(attempt, outcome) => {
                 self.tasks.remove(&attempt);
@@ -337,6 +368,7 @@ impl Agent {
                 self.held.finish(attempt, Outcome::Failure(failure));
             }
         }
+        Ok(())
     }
 
     fn give_up(&mut self, attempt: JobAttempt) {
@@ -371,8 +403,13 @@ impl Agent {
 }
 
 /// Waits, but not longer than until something happens.
-async fn pause(duration: Duration, inbox: &mut mpsc::Receiver<Event>, agent: &mut Agent) {
-    if let Ok(Some(event)) = tokio::time::timeout(duration, inbox.recv()).await {
-        agent.note(event);
+async fn pause(
+    duration: Duration,
+    inbox: &mut mpsc::Receiver<Event>,
+    agent: &mut Agent,
+) -> Result<(), WorkerError> {
+    match tokio::time::timeout(duration, inbox.recv()).await {
+        Ok(Some(event)) => agent.note(event),
+        _ => Ok(()),
     }
 }

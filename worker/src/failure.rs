@@ -9,6 +9,7 @@ use thiserror::Error;
 
 use crate::blob::BlobError;
 use crate::device::DeviceError;
+use crate::files::FileError;
 use crate::images::ImagesError;
 use crate::store::StoreError;
 
@@ -75,8 +76,12 @@ impl JobError {
     /// What the coordinator is told.
     pub fn to_failure(&self) -> Failure {
         let (code, retryable, counts_against_job) = match self {
+            // The store's trouble is not the job's.
+            Self::Image(ImagesError::File(FileError::Store { .. }))
+            | Self::Input { .. }
+            | Self::Weights(_) => ("store-read", true, false),
             // The bytes are fixed by their hash, so another try sees the same.
-            Self::Image(ImagesError::Read { .. }) => ("image-read", true, true),
+            Self::Image(ImagesError::File(FileError::Read { .. })) => ("image-read", true, true),
             Self::Image(_) => ("image", false, true),
             // The device is the worker's trouble, not the job's: the worker goes, see `is_fatal`.
             Self::Device(DeviceError::Load { .. }) => ("load", true, false),
@@ -86,8 +91,6 @@ impl JobError {
             Self::Device(DeviceError::Gone) => ("device-gone", true, true),
             Self::Lost { .. } => ("input-lost", true, false),
             Self::Malformed { .. } => ("input-malformed", true, true),
-            // The store's trouble is not the job's.
-            Self::Input { .. } | Self::Weights(_) => ("store-read", true, false),
             Self::Store(_) => ("store-write", true, false),
             Self::Bands(_) => ("bands", false, true),
             Self::NoDepthMap => ("no-depth-map", false, true),
@@ -138,7 +141,7 @@ mod tests {
 
     #[test]
     fn a_damaged_image_is_not_tried_again() {
-        let error = JobError::Image(ImagesError::Changed { path: "a.jpg".into() });
+        let error = JobError::Image(FileError::Changed { path: "a.jpg".into() }.into());
         assert!(!error.to_failure().retryable);
         assert_eq!(error.to_failure().message, "image a.jpg has changed since the run was planned");
     }

@@ -1,7 +1,5 @@
 //! Working images, decoded once for all the jobs that need them.
 
-use std::io;
-use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use planesweep_plan::{BlobKey, ImageSpec, MaskSpec};
@@ -11,25 +9,15 @@ use quick_cache::sync::Cache;
 use thiserror::Error;
 
 use crate::cache::cache;
+use crate::files::{FileError, Files};
+use crate::jobs::compute;
 
 /// Why a working image could not be made.
 #[derive(Debug, Error)]
 pub enum ImagesError {
-    /// The file cannot be read.
-    #[error("cannot read image {}", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// What the system said.
-        #[source]
-        source: io::Error,
-    },
-    /// The file is not the one that was planned with.
-    #[error("image {} has changed since the run was planned", path.display())]
-    Changed {
-        /// The file.
-        path: PathBuf,
-    },
+    /// Its bytes cannot be had.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// The file is no image.
     #[error("cannot decode view {name}")]
     Decode {
@@ -70,16 +58,18 @@ impl Weighter<ImageKey, Arc<WorkingImage>> for ByPixels {
 
 /// Working images within a budget of bytes.
 pub(crate) struct Images {
+    files: Files,
     cache: Cache<ImageKey, Arc<WorkingImage>, ByPixels>,
 }
 
 impl Images {
-    pub fn new(budget_bytes: u64) -> Self {
-        Self { cache: cache(budget_bytes, ByPixels) }
+    pub fn new(files: Files, budget_bytes: u64) -> Self {
+        Self { files, cache: cache(budget_bytes, ByPixels) }
     }
 
-    /// The working image of a specification; several that ask for the same one wait for one of them.
-    pub async fn get(&self, spec: &ImageSpec) -> Result<Arc<WorkingImage>, ImagesError> {
+    /// The working image of a specification; several that ask for the same one wait for one of them. Counts
+    /// files that come from the store.
+    pub async fn get(&self, spec: &ImageSpec, fetched: &mut u32) -> Result<Arc<WorkingImage>, ImagesError> {
         let key = ImageKey {
             file: spec.hash,
             width: spec.working_width,
@@ -88,32 +78,27 @@ impl Images {
         };
         let spec = spec.clone();
         let make = async {
-            tokio::task::spawn_blocking(move || load(&spec).map(Arc::new))
-                .await
-                .expect("loading an image does not panic")
+            let bytes = self.files.get(&spec.path, spec.hash, fetched).await?;
+            compute(move || prepare(&spec, &bytes).map(Arc::new)).await
         };
         self.cache.get_or_insert_async(&key, make).await
     }
+
+    /// The mask of a specification; counted as an image.
+    pub async fn mask(&self, spec: MaskSpec, fetched: &mut u32) -> Result<Raster<[u8; 3]>, ImagesError> {
+        let bytes = self.files.get(&spec.path, spec.hash, fetched).await?;
+        compute(move || {
+            let name = || spec.path.display().to_string();
+            decode_image(&spec.path, &bytes).map_err(|source| ImagesError::Decode { name: name(), source })
+        })
+        .await
+    }
 }
 
-/// The mask of a specification.
-pub(crate) fn load_mask(spec: &MaskSpec) -> Result<Raster<[u8; 3]>, ImagesError> {
-    let bytes = bytes(&spec.path, spec.hash)?;
-    let name = || spec.path.display().to_string();
-    decode_image(&spec.path, &bytes).map_err(|source| ImagesError::Decode { name: name(), source })
-}
-
-/// The bytes of a file, which must be those that the run was planned with.
-fn bytes(path: &Path, hash: BlobKey) -> Result<Vec<u8>, ImagesError> {
-    let bytes = std::fs::read(path).map_err(|source| ImagesError::Read { path: path.to_owned(), source })?;
-    if BlobKey::of(&bytes) == hash { Ok(bytes) } else { Err(ImagesError::Changed { path: path.to_owned() }) }
-}
-
-fn load(spec: &ImageSpec) -> Result<WorkingImage, ImagesError> {
-    let bytes = bytes(&spec.path, spec.hash)?;
+fn prepare(spec: &ImageSpec, bytes: &[u8]) -> Result<WorkingImage, ImagesError> {
     let name = || spec.name.clone();
     let pixels =
-        decode_image(&spec.path, &bytes).map_err(|source| ImagesError::Decode { name: name(), source })?;
+        decode_image(&spec.path, bytes).map_err(|source| ImagesError::Decode { name: name(), source })?;
     WorkingImage::prepare(pixels, &spec.camera, &spec.distortion, spec.working_width, spec.working_height)
         .map_err(|source| ImagesError::Prepare { name: name(), source })
 }

@@ -10,7 +10,7 @@ use planesweep_fusion::{
     filter,
 };
 use planesweep_plan::{BlobKey, EmitSpec, FilterSpec, FitSpec, InferSpec, JobId, JobSpec};
-use planesweep_proto::{Grant, Input, Produced, Success, Way};
+use planesweep_proto::{Grant, IMAGES_FETCHED, Input, Produced, Success, Way};
 use planesweep_scene::DepthMap;
 use tokio::sync::Semaphore;
 use tokio::task::spawn_blocking;
@@ -19,9 +19,11 @@ use tokio_util::sync::CancellationToken;
 use crate::blob::{decode_depth_map, depth_map_bytes, encode_depth_map, encode_points};
 use crate::cloud::assemble;
 use crate::device::{Device, InferRequest};
+use crate::disk_cache::DiskCache;
 use crate::exchange::{Exchange, Written};
 use crate::failure::JobError;
-use crate::images::{Images, load_mask};
+use crate::files::Files;
+use crate::images::Images;
 use crate::maps::Maps;
 use crate::store::{Store, StoreError};
 
@@ -43,15 +45,16 @@ type Made = (Written, BTreeMap<String, f64>);
 type Ways = BTreeMap<Way, u32>;
 
 impl Jobs {
-    /// `cache_bytes` is the budget of images in memory.
+    /// `cache_bytes` is the budget of images in memory, `disk` keeps the files that come from the store.
     pub fn new(
         store: Store,
         device: Device,
         cache_bytes: u64,
+        disk: DiskCache,
         maps: Arc<Maps>,
         exchange: Arc<Exchange>,
     ) -> Self {
-        let images = Images::new(cache_bytes);
+        let images = Images::new(Files::new(store.clone(), disk), cache_bytes);
         Self { store, images, device, device_turn: Semaphore::new(1), maps, exchange }
     }
 
@@ -103,10 +106,11 @@ impl Jobs {
     ) -> Result<Made, JobError> {
         check(cancelled)?;
         let weights = self.store.get(&spec.weights).await.map_err(JobError::Weights)?;
-        let reference = self.images.get(&spec.reference).await?;
+        let mut fetched = 0;
+        let reference = self.images.get(&spec.reference, &mut fetched).await?;
         let mut sources = Vec::with_capacity(spec.sources.len());
         for source in &spec.sources {
-            sources.push(self.images.get(source).await?);
+            sources.push(self.images.get(source, &mut fetched).await?);
         }
         let turn = tokio::select! {
             turn = self.device_turn.acquire() => turn,
@@ -123,8 +127,11 @@ impl Jobs {
         };
         let map = self.device.infer(request).await?;
         drop(turn);
-        let network_seconds = ("network_seconds".to_owned(), begun.elapsed().as_secs_f64());
-        Ok((self.keep(map).await, BTreeMap::from([network_seconds])))
+        let measurements = [
+            ("network_seconds".to_owned(), begun.elapsed().as_secs_f64()),
+            (IMAGES_FETCHED.to_owned(), fetched.into()),
+        ];
+        Ok((self.keep(map).await, BTreeMap::from(measurements)))
     }
 
     async fn stitch(&self, inputs: &[Input]) -> Result<Made, JobError> {
@@ -143,17 +150,24 @@ impl Jobs {
         let input = inputs.first().ok_or(JobError::NoDepthMap)?;
         let mut ways = Ways::new();
         let map = self.depth_map(input, &mut ways).await?.ok_or(JobError::NoDepthMap)?;
-        let image = self.images.get(&spec.image).await?;
-        let FitSpec { mask, full_resolution, .. } = spec.clone();
+        let mut fetched = 0;
+        let image = self.images.get(&spec.image, &mut fetched).await?;
+        let mask = match spec.mask.clone() {
+            Some(mask) => Some(self.images.mask(mask, &mut fetched).await?),
+            None => None,
+        };
+        let full_resolution = spec.full_resolution;
         let fitted = compute(move || {
             let mut map = DepthMap::clone(&map);
             if let Some(mask) = &mask {
-                map.leave_out(&load_mask(mask)?);
+                map.leave_out(mask);
             }
-            Ok::<_, JobError>(if full_resolution { map.upsampled(&image) } else { map })
+            if full_resolution { map.upsampled(&image) } else { map }
         })
-        .await?;
-        Ok((self.keep(fitted).await, counted(&ways)))
+        .await;
+        let mut measurements = counted(&ways);
+        measurements.insert(IMAGES_FETCHED.to_owned(), fetched.into());
+        Ok((self.keep(fitted).await, measurements))
     }
 
     /// The map as bytes. It stays in memory too, for neighbouring views filter against it soon.

@@ -4,7 +4,8 @@
 //! coordinator <── agent (the report loop) ── held (what it holds, pure)
 //!                   │ spawns
 //!                   └─> jobs (one job from grant to stored result)
-//!                         ├─ images ── device (one thread owns the network)
+//!                         ├─ images ── files (of the scene) ── disk_cache
+//!                         ├─ device (one thread owns the network)
 //!                         ├─ maps (decoded, in memory) ── exchange (from and to other workers)
 //!                         ├─ cloud
 //!                         └─ planesweep_store (the truth of every result) ── blob (maps as bytes)
@@ -19,8 +20,10 @@ mod blob;
 mod cache;
 mod cloud;
 mod device;
+mod disk_cache;
 mod exchange;
 mod failure;
+mod files;
 mod held;
 mod images;
 mod jobs;

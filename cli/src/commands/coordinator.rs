@@ -5,14 +5,15 @@ use std::time::Duration;
 
 use anyhow::{Context, Result};
 use clap::Args;
-use planesweep_coordinator::{Config, Coordinator};
-use planesweep_store::Store;
+use planesweep_coordinator::{Config, Coordinator, ServedStore};
+use planesweep_store::Objects;
 use serde_json::json;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::args::values::seconds;
 use crate::args::{TokenArgs, store_url};
 use crate::console::Outcome;
+use crate::host::unique;
 
 /// Arguments of `coordinator`.
 #[derive(Debug, Args)]
@@ -29,7 +30,8 @@ pub struct CoordinatorArgs {
     /// coordinators share, postgres://user:password@host/database.
     #[arg(long, env = "PLANESWEEP_LEDGER", hide_env_values = true, value_name = "FILE|URL")]
     pub ledger: String,
-    /// Where results lie: a folder that all workers reach under this path, or its file:// address.
+    /// Where results lie: a folder, or an object store such as s3://bucket/prefix. Workers and clients that do
+    /// not reach it get and send their blobs through the coordinator.
     #[arg(long, env = "PLANESWEEP_STORE", value_name = "URL", value_parser = store_url)]
     pub store: String,
     #[command(flatten)]
@@ -41,14 +43,17 @@ pub struct CoordinatorArgs {
 
 /// Serves until told to stop.
 pub fn run(args: &CoordinatorArgs) -> Result<Outcome> {
-    let store = Store::open(&args.store)?;
+    let store = Objects::open(&args.store)?;
+    let runtime = tokio::runtime::Runtime::new().context("cannot start the runtime")?;
+    let nonce = unique().context("cannot make an identity for the store")?;
+    let identity = runtime.block_on(store.identity(&nonce))?;
     let config = Config {
         listen: args.listen,
         lease: args.lease,
         token: args.token.read()?,
+        served: Some(ServedStore { store: store.clone(), identity }),
         ..Config::new(&*args.ledger, store.url())
     };
-    let runtime = tokio::runtime::Runtime::new().context("cannot start the runtime")?;
     let url = runtime.block_on(serve(config))?;
     Ok(Outcome { text: String::new(), value: json!({ "url": url }), skipped_views: false })
 }

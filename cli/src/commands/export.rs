@@ -8,7 +8,7 @@ use anyhow::{Context, Result, bail};
 use bytes::Bytes;
 use planesweep_fusion::{VertexFormat, decode_filtered_map};
 use planesweep_plan::{BlobKey, Job, JobId, NUMERICS_VERSION, ViewPlan, sparse_depths};
-use planesweep_proto::{CODE_VERSION, JobResult, JobState, maps_by_way};
+use planesweep_proto::{CODE_VERSION, JobResult, JobState, images_fetched, maps_by_way};
 use planesweep_report::{
     Funnel, Pictures, RunReport, SkippedView, StageReport, Totals, ViewReport, encode_png, render_cloud,
     render_html,
@@ -118,6 +118,9 @@ pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Out
     let ways: Vec<String> =
         maps_by_way(run.results).iter().map(|(way, maps)| format!("{maps} {way}")).collect();
     text.push_str(&format!("maps reached the fusion: {}\n", ways.join(", ")));
+    if report.images_fetched > 0 {
+        text.push_str(&format!("{} photographs and masks came from the store\n", report.images_fetched));
+    }
     for view in &skipped {
         text.push_str(&format!("skipped: {}: {}\n", view.view, view.reason));
     }
@@ -361,6 +364,7 @@ fn report(
             .into_iter()
             .map(|(way, maps)| (way.to_string(), maps))
             .collect(),
+        images_fetched: images_fetched(run.results),
         totals: Totals { points, wall_seconds: begun.elapsed().as_secs_f64() },
     }
 }

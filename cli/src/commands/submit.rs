@@ -15,6 +15,7 @@ use crate::console::Outcome;
 use crate::interrupts::Interrupts;
 use crate::out_folder::check_out;
 use crate::prepare::{Network, Prepared, Stages};
+use crate::upload::{Uploaded, upload};
 
 /// Arguments of `submit`.
 #[derive(Debug, Args)]
@@ -44,6 +45,10 @@ pub struct SubmitArgs {
     /// STEM.mask.png beside the photographs.
     #[arg(long, value_name = "DIR")]
     pub masks: Option<PathBuf>,
+    /// Copy photographs and masks to the store, those that it does not have, for workers that do not find them
+    /// under their paths; done in any case when this host does not reach the store but through the coordinator.
+    #[arg(long)]
+    pub upload: bool,
     #[command(flatten)]
     pub plan: PlanArgs,
     #[command(flatten)]
@@ -61,9 +66,10 @@ pub fn run(args: &SubmitArgs, json: bool) -> Result<Outcome> {
     // Before anything that takes long.
     let (client, store) = runtime.block_on(async {
         let mut client = args.connect.client()?;
-        let url = client.store_url().await;
-        let url = url.with_context(|| format!("cannot submit to {}", args.connect.coordinator))?;
-        Ok::<_, anyhow::Error>((client, Store::open(&url)?.patient(interrupts.drain.clone())))
+        let place = client.store().await;
+        let place = place.with_context(|| format!("cannot submit to {}", args.connect.coordinator))?;
+        let store = Store::of(&client, &place).await?.patient(interrupts.drain.clone());
+        Ok::<_, anyhow::Error>((client, store))
     })?;
     if let Some(out) = &args.out {
         check_out(out, &args.scene)?;
@@ -83,6 +89,10 @@ pub fn run(args: &SubmitArgs, json: bool) -> Result<Outcome> {
     }
     let put = store.put(prepared.network.bytes.clone().into());
     runtime.block_on(put).context("cannot store the weights")?;
+    if args.upload || !store.is_reached_from_here() {
+        let Uploaded { sent, files } = runtime.block_on(upload(&prepared.jobs, &store))?;
+        eprintln!("{sent} of {files} photographs and masks uploaded, the store has the others");
+    }
     let computation = Computation { client, store: &store, prepared: &prepared, exclusive: false };
     let Some(out) = &args.out else {
         let submitted = runtime.block_on(computation.submit(Vec::new()))?;

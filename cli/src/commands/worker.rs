@@ -3,6 +3,7 @@
 use std::fmt;
 use std::io::Read;
 use std::net::SocketAddr;
+use std::path::PathBuf;
 
 use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
@@ -15,6 +16,7 @@ use tokio_util::sync::CancellationToken;
 use crate::args::ConnectArgs;
 use crate::args::values::bytes;
 use crate::console::Outcome;
+use crate::host;
 use crate::network::{Placement, backend_factory, processors};
 
 /// Arguments of `worker`.
@@ -46,6 +48,13 @@ pub struct WorkerArgs {
     /// Memory for inference, such as 800M or 2G.
     #[arg(long, value_name = "SIZE", value_parser = bytes)]
     pub memory: Option<u64>,
+    /// Where photographs are kept that come from the store, because they do not lie under their paths here; all
+    /// workers of a host may share it. By default planesweep/photographs in the user's cache folder.
+    #[arg(long, env = "PLANESWEEP_CACHE", value_name = "DIR", default_value_os_t = cache_folder())]
+    pub cache: PathBuf,
+    /// How much is kept there; what was not used for the longest time goes first.
+    #[arg(long, value_name = "SIZE", default_value = "8G", value_parser = bytes)]
+    pub cache_size: u64,
     /// Stop when standard input ends, that is, when the process that started this one is gone.
     #[arg(long, hide = true)]
     pub stop_with_stdin: bool,
@@ -94,16 +103,15 @@ pub fn run(args: WorkerArgs) -> Result<Outcome> {
         RoleArg::Fuse => Role::Fuse,
         RoleArg::Both => Role::Both,
     };
-    let host = read_system("/proc/sys/kernel/hostname").unwrap_or_else(|| "localhost".to_owned());
-    let boot_id = read_system("/proc/sys/kernel/random/boot_id").unwrap_or_default();
-    // A new one for every life of the process: the kernel makes it.
-    let nonce = read_system("/proc/sys/kernel/random/uuid").context("cannot make an id for this worker")?;
+    let host = host::name();
+    // A new one for every life of the process.
+    let nonce = host::unique().context("cannot make an id for this worker")?;
     let config = WorkerConfig {
         coordinator: args.connect.coordinator,
         token: args.connect.token.read()?,
         id: WorkerId(format!("{host}-{}-{}", std::process::id(), &nonce[..8.min(nonce.len())])),
         host,
-        boot_id,
+        boot_id: host::boot_id(),
         role,
         backend: backend_factory(&Placement {
             device: args.device.clone(),
@@ -113,6 +121,7 @@ pub fn run(args: WorkerArgs) -> Result<Outcome> {
         device: args.device,
         slots: SLOTS,
         cache_bytes: CACHE_BYTES,
+        disk_cache: (args.cache, args.cache_size),
         exchange: ExchangeConfig { listen: args.listen, shared_memory: !args.no_shared_memory },
     };
     let id = config.id.0.clone();
@@ -144,8 +153,11 @@ pub fn run(args: WorkerArgs) -> Result<Outcome> {
     Ok(Outcome { text: String::new(), value: json!({ "worker": id }), skipped_views: false })
 }
 
-fn read_system(path: &str) -> Option<String> {
-    std::fs::read_to_string(path).ok().map(|text| text.trim().to_owned())
+/// Beside what the program's scripts keep.
+fn cache_folder() -> PathBuf {
+    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    let users = set("XDG_CACHE_HOME").or_else(|| Some(set("HOME")?.join(".cache")));
+    users.unwrap_or_else(std::env::temp_dir).join("planesweep/photographs")
 }
 
 /// Ctrl-C reaches the whole group of processes; whoever started this one decides what it means.

@@ -18,7 +18,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use planesweep_plan::{JobId, WorkerId};
-use planesweep_proto::{Code, Order, Produced, Role, ServiceError, WorkerState, WorkerStatus};
+use planesweep_proto::{Code, Order, Produced, Role, ServiceError, StorePlace, WorkerState, WorkerStatus};
 use tokio::sync::{mpsc, watch};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
@@ -40,7 +40,7 @@ const MAX_KNOWN_WORKERS: usize = 10_000;
 pub(crate) struct Settings {
     pub lease: Duration,
     pub report_interval: Duration,
-    pub store_url: String,
+    pub store: StorePlace,
 }
 
 impl Settings {

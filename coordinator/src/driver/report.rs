@@ -266,7 +266,7 @@ impl Driver {
             grants: Vec::new(),
             revoked: commands.iter().filter_map(revoked).collect(),
             acknowledged: commands.iter().filter_map(acknowledged).collect(),
-            store_url: self.settings.store_url.clone(),
+            store: self.settings.store.clone(),
             order: self.order,
             peers: Vec::new(),
         }

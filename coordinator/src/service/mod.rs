@@ -1,5 +1,6 @@
 //! The gRPC handlers: decode, hand to the driver or the ledger, encode. No decisions.
 
+mod blobs;
 mod report;
 mod runs;
 
@@ -9,9 +10,11 @@ use std::sync::Arc;
 use planesweep_plan::NUMERICS_VERSION;
 use planesweep_proto::limits::MAX_MESSAGE_BYTES;
 use planesweep_proto::wire::coordinator_server::{Coordinator, CoordinatorServer};
-use planesweep_proto::{CODE_VERSION, Code, PROTOCOL_VERSION, ServiceError, wire};
+use planesweep_proto::{CODE_VERSION, Code, PROTOCOL_VERSION, ServiceError, StorePlace, wire};
 use tokio_stream::Stream;
 use tonic::{Request, Response, Status, Streaming};
+
+pub(crate) use blobs::BlobService;
 
 use crate::driver::{DriverHandle, describe};
 use crate::ledger::{Ledger, LedgerError};
@@ -21,7 +24,7 @@ use crate::ledger::{Ledger, LedgerError};
 pub(crate) struct Service {
     pub driver: DriverHandle,
     pub ledger: Arc<Ledger>,
-    pub store_url: String,
+    pub store: StorePlace,
 }
 
 impl Service {

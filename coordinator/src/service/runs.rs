@@ -22,7 +22,7 @@ impl Service {
     ) -> Result<wire::DescribeReply, ServiceError> {
         check_protocol(request.protocol_version)?;
         check_versions("the caller", &request.code_version, request.numerics_version)?;
-        Ok(wire::DescribeReply { store_url: self.store_url.clone() })
+        Ok((&self.store).into())
     }
 
     pub(super) async fn answer_runs(&self) -> Result<wire::RunsReply, ServiceError> {

@@ -13,7 +13,7 @@ use crate::limits::{
 };
 use crate::{
     Endpoint, Failure, FinishedJob, Grant, HeldJob, Input, JobAttempt, Order, Outcome, Peer, Produced,
-    Report, ReportReply, Role, Slots, Success, WireError, WorkerState, wire,
+    Report, ReportReply, Role, Slots, StorePlace, Success, WireError, WorkerState, wire,
 };
 
 impl From<&Report> for wire::ReportRequest {
@@ -240,9 +240,10 @@ impl From<&ReportReply> for wire::ReportReply {
             grants: reply.grants.iter().map(Into::into).collect(),
             revoked: reply.revoked.iter().map(|job| (*job).into()).collect(),
             acknowledged: reply.acknowledged.iter().map(|job| (*job).into()).collect(),
-            store_url: reply.store_url.clone(),
+            store_url: reply.store.url.clone(),
             order: order.into(),
             peers: reply.peers.iter().map(Into::into).collect(),
+            store_identity: reply.store.identity.clone().unwrap_or_default(),
         }
     }
 }
@@ -264,7 +265,7 @@ impl TryFrom<wire::ReportReply> for ReportReply {
             grants: each(reply.grants, TryInto::try_into)?,
             revoked: each(reply.revoked, TryInto::try_into)?,
             acknowledged: each(reply.acknowledged, TryInto::try_into)?,
-            store_url: short("store url", reply.store_url, MAX_MESSAGE_TEXT_BYTES)?,
+            store: store_place(reply.store_url, reply.store_identity)?,
             order: match wire::Order::try_from(reply.order) {
                 Ok(wire::Order::Work) => Order::Work,
                 Ok(wire::Order::Drain) => Order::Drain,
@@ -273,6 +274,27 @@ impl TryFrom<wire::ReportReply> for ReportReply {
             },
             peers: each(reply.peers, TryInto::try_into)?,
         })
+    }
+}
+
+fn store_place(url: String, identity: String) -> Result<StorePlace, WireError> {
+    let url = short("store url", url, MAX_MESSAGE_TEXT_BYTES)?;
+    let identity = optional_name("store identity", identity)?;
+    Ok(StorePlace { url, identity: Some(identity).filter(|identity| !identity.is_empty()) })
+}
+
+impl From<&StorePlace> for wire::DescribeReply {
+    fn from(store: &StorePlace) -> Self {
+        let store_identity = store.identity.clone().unwrap_or_default();
+        Self { store_url: store.url.clone(), store_identity }
+    }
+}
+
+impl TryFrom<wire::DescribeReply> for StorePlace {
+    type Error = WireError;
+
+    fn try_from(reply: wire::DescribeReply) -> Result<Self, WireError> {
+        store_place(reply.store_url, reply.store_identity)
     }
 }
 
@@ -450,15 +472,16 @@ mod tests {
             };
             peers.into_iter().map(peer).collect()
         });
-        (any::<u64>(), 1..u32::MAX, grants, attempts(), attempts(), order, peers).prop_map(
-            |(offset_ms, ms, grants, revoked, acknowledged, order, peers)| ReportReply {
+        let store = ("[a-z:/0-9]{1,9}", text()).prop_map(|(url, identity)| StorePlace { url, identity });
+        (any::<u64>(), 1..u32::MAX, grants, attempts(), attempts(), store, order, peers).prop_map(
+            |(offset_ms, ms, grants, revoked, acknowledged, store, order, peers)| ReportReply {
                 offset_ms,
                 lease: Duration::from_millis(ms.into()),
                 report_interval: Duration::from_millis(ms.into()),
                 grants,
                 revoked,
                 acknowledged,
-                store_url: "file:///store".into(),
+                store,
                 order,
                 peers,
             },

@@ -1,0 +1,20 @@
+//! Folders that a process does not see although others do.
+
+use std::process::Command;
+
+/// Whether a file system can be mounted for one process alone; if not, a line on stderr says that `test` is skipped.
+pub fn can_mount(test: &str) -> bool {
+    let tried = Command::new("unshare").args(["-m", "mount", "-t", "tmpfs", "tmpfs", "/dev/shm"]).output();
+    let can = tried.is_ok_and(|tried| tried.status.success());
+    if !can {
+        eprintln!("SKIPPED {test}: mounting for one process alone needs root");
+    }
+    can
+}
+
+/// A shell script that starts `"$0" "$@"` where these folders are empty.
+pub fn hiding(folders: &[&str]) -> String {
+    let mounts: Vec<String> =
+        folders.iter().map(|folder| format!("mount -t tmpfs tmpfs {folder} || exit 9; ")).collect();
+    format!("exec unshare -m sh -c '{}exec \"$0\" \"$@\"' \"$0\" \"$@\"", mounts.concat())
+}
