@@ -26,10 +26,12 @@ use crate::files::Files;
 use crate::images::Images;
 use crate::maps::Maps;
 use crate::store::{Store, StoreError};
+use crate::weights::WeightsFiles;
 
 /// All that jobs share on a worker.
 pub(crate) struct Jobs {
     store: Store,
+    weights: WeightsFiles,
     images: Images,
     device: Device,
     /// One inference at a time; the next one loads its images meanwhile.
@@ -54,8 +56,9 @@ impl Jobs {
         maps: Arc<Maps>,
         exchange: Arc<Exchange>,
     ) -> Self {
+        let weights = WeightsFiles::new(store.clone());
         let images = Images::new(Files::new(store.clone(), disk), cache_bytes);
-        Self { store, images, device, device_turn: Semaphore::new(1), maps, exchange }
+        Self { store, weights, images, device, device_turn: Semaphore::new(1), maps, exchange }
     }
 
     /// Does a job. `started` is called when computing begins; a job cancelled before its result is
@@ -105,7 +108,7 @@ impl Jobs {
         started: impl FnOnce(),
     ) -> Result<Made, JobError> {
         check(cancelled)?;
-        let weights = self.store.get(&spec.weights).await.map_err(JobError::Weights)?;
+        let weights = self.weights.get(&spec.weights).await.map_err(JobError::Weights)?;
         let mut fetched = 0;
         let reference = self.images.get(&spec.reference, &mut fetched).await?;
         let mut sources = Vec::with_capacity(spec.sources.len());

@@ -5,7 +5,7 @@
 //!                   │ spawns
 //!                   └─> jobs (one job from grant to stored result)
 //!                         ├─ images ── files (of the scene) ── disk_cache
-//!                         ├─ device (one thread owns the network)
+//!                         ├─ device (one thread owns the network) ── weights
 //!                         ├─ maps (decoded, in memory) ── exchange (from and to other workers)
 //!                         ├─ cloud
 //!                         └─ planesweep_store (the truth of every result) ── blob (maps as bytes)
@@ -28,6 +28,7 @@ mod held;
 mod images;
 mod jobs;
 mod maps;
+mod weights;
 
 use planesweep_store as store;
 
