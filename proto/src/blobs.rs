@@ -9,6 +9,7 @@ use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 
 use crate::client::WithToken;
+use crate::failover::Failover;
 use crate::limits::{FETCH_CHUNK_BYTES, MAX_BLOB_BYTES, MAX_EXCHANGE_MESSAGE_BYTES};
 use crate::wire::blobs_client::BlobsClient;
 use crate::{Code, ServiceError, wire};
@@ -16,33 +17,41 @@ use crate::{Code, ServiceError, wire};
 /// What may be under way before it is read: enough for a fast network, and bounded.
 const WINDOW_BYTES: u32 = 4 << 20;
 
-/// A client of a coordinator's store; cheap to clone, clones share the connection.
+type Stub = BlobsClient<InterceptedService<Channel, WithToken>>;
+
+/// A client of the store of a coordinator, or of several; cheap to clone, clones share the connections.
 #[derive(Clone)]
 pub struct BlobClient {
-    stub: BlobsClient<InterceptedService<Channel, WithToken>>,
+    coordinators: Failover<Stub>,
 }
 
 impl BlobClient {
     /// Must be called within a tokio runtime.
-    pub(crate) fn new(endpoint: &Endpoint, token: WithToken) -> Self {
-        let endpoint = endpoint
-            .clone()
-            .initial_stream_window_size(WINDOW_BYTES)
-            .initial_connection_window_size(WINDOW_BYTES);
-        let stub = BlobsClient::with_interceptor(endpoint.connect_lazy(), token)
-            .max_decoding_message_size(MAX_EXCHANGE_MESSAGE_BYTES)
-            .max_encoding_message_size(MAX_EXCHANGE_MESSAGE_BYTES);
-        Self { stub }
+    pub(crate) fn new(endpoints: &[Endpoint], token: &WithToken) -> Self {
+        let stub = |endpoint: &Endpoint| {
+            let endpoint = endpoint
+                .clone()
+                .initial_stream_window_size(WINDOW_BYTES)
+                .initial_connection_window_size(WINDOW_BYTES);
+            BlobsClient::with_interceptor(endpoint.connect_lazy(), token.clone())
+                .max_decoding_message_size(MAX_EXCHANGE_MESSAGE_BYTES)
+                .max_encoding_message_size(MAX_EXCHANGE_MESSAGE_BYTES)
+        };
+        Self { coordinators: Failover::new(endpoints.iter().map(stub).collect()) }
     }
 
     /// Whether the store has the blob, whole and undamaged.
     pub async fn find(&mut self, key: &BlobKey) -> Result<bool, ServiceError> {
-        Ok(self.stub.find(wire::FindRequest { blob: key.0.to_vec() }).await?.into_inner().found)
+        let request = wire::FindRequest { blob: key.0.to_vec() };
+        let find = |mut stub: Stub| async move { stub.find(request).await };
+        Ok(self.coordinators.call(find).await?.into_inner().found)
     }
 
     /// The bytes that the store has under this key. Their hash is the caller's to check.
     pub async fn read(&mut self, key: &BlobKey) -> Result<Bytes, ServiceError> {
-        let mut chunks = self.stub.read(wire::ReadRequest { blob: key.0.to_vec() }).await?.into_inner();
+        let request = wire::ReadRequest { blob: key.0.to_vec() };
+        let read = |mut stub: Stub| async move { stub.read(request).await };
+        let mut chunks = self.coordinators.call(read).await?.into_inner();
         let mut bytes = BytesMut::new();
         while let Some(chunk) = chunks.next().await {
             bytes.extend_from_slice(&chunk?.data);
@@ -61,7 +70,9 @@ impl BlobClient {
             let data = bytes.slice(start..bytes.len().min(start + FETCH_CHUNK_BYTES));
             wire::WriteChunk { blob: None, data }
         });
-        self.stub.write(tokio_stream::iter(std::iter::once(header).chain(chunks))).await?;
+        let chunks = tokio_stream::iter(std::iter::once(header).chain(chunks));
+        let write = |mut stub: Stub| async move { stub.write(chunks).await };
+        self.coordinators.call(write).await?;
         Ok(())
     }
 }

@@ -10,6 +10,7 @@ use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Request, Status};
 
+use crate::failover::Failover;
 use crate::limits::{MAX_MESSAGE_BYTES, SUBMIT_CHUNK_BYTES};
 use crate::wire::coordinator_client::CoordinatorClient;
 use crate::{
@@ -57,32 +58,44 @@ impl tonic::service::Interceptor for WithToken {
 
 type Stub = CoordinatorClient<InterceptedService<Channel, WithToken>>;
 
-/// A client of one coordinator; cheap to clone, clones share the connection.
+/// A client of one coordinator, or of several that share a ledger: one of them is called until it cannot be
+/// reached, then the next. Cheap to clone; clones share the connections and the choice.
 #[derive(Clone)]
 pub struct Client {
-    stub: Stub,
+    coordinators: Failover<Stub>,
     blobs: BlobClient,
 }
 
 impl Client {
-    /// A client of the coordinator at `url`, such as `http://127.0.0.1:7070`. The connection is made
-    /// by the first call and again by the next call after it broke.
+    /// A client of the coordinator at `url`, such as `http://127.0.0.1:7070`, or of several, with commas
+    /// between. A connection is made by the first call and again by the next call after it broke.
     ///
     /// Must be called within a tokio runtime.
     pub fn connect(url: &str, token: Option<&str>) -> Result<Self, ServiceError> {
-        let token = token.map(bearer).transpose()?;
-        let endpoint = Endpoint::from_shared(url.to_owned())
-            .map_err(|e| ServiceError::new(Code::Invalid, format!("\"{url}\" is no address: {e}")))?
-            .connect_timeout(CONNECT_TIMEOUT)
-            .tcp_nodelay(true)
-            .http2_keep_alive_interval(KEEP_ALIVE.0)
-            .keep_alive_timeout(KEEP_ALIVE.1)
-            .keep_alive_while_idle(true);
-        let blobs = BlobClient::new(&endpoint, WithToken(token.clone()));
-        let stub = CoordinatorClient::with_interceptor(endpoint.connect_lazy(), WithToken(token))
-            .max_decoding_message_size(MAX_MESSAGE_BYTES)
-            .max_encoding_message_size(MAX_MESSAGE_BYTES);
-        Ok(Self { stub, blobs })
+        let token = WithToken(token.map(bearer).transpose()?);
+        let endpoints = url.split(',').map(str::trim).map(endpoint).collect::<Result<Vec<_>, _>>()?;
+        let blobs = BlobClient::new(&endpoints, &token);
+        let stub = |endpoint: &Endpoint| {
+            CoordinatorClient::with_interceptor(endpoint.connect_lazy(), token.clone())
+                .max_decoding_message_size(MAX_MESSAGE_BYTES)
+                .max_encoding_message_size(MAX_MESSAGE_BYTES)
+        };
+        Ok(Self { coordinators: Failover::new(endpoints.iter().map(stub).collect()), blobs })
+    }
+
+    /// How many coordinators there are.
+    pub fn coordinators(&self) -> usize {
+        self.coordinators.len()
+    }
+
+    /// The one that is called now, by its place in the list.
+    pub fn coordinator(&self) -> usize {
+        self.coordinators.current()
+    }
+
+    /// Calls the next one from now on, unless another is called already.
+    pub fn leave(&self, coordinator: usize) {
+        self.coordinators.leave(coordinator);
     }
 
     /// Reports, and learns what to do next. Dropping the future before it ends is safe: what it
@@ -90,7 +103,8 @@ impl Client {
     pub async fn report(&mut self, report: &Report) -> Result<ReportReply, ServiceError> {
         let mut request = Request::new(wire::ReportRequest::from(report));
         request.set_timeout(report.max_wait + REPORT_TIMEOUT);
-        Ok(self.stub.report(request).await?.into_inner().try_into()?)
+        let call = |mut stub: Stub| async move { stub.report(request).await };
+        Ok(self.coordinators.call(call).await?.into_inner().try_into()?)
     }
 
     /// Submits a plan; each job follows those that it needs. A job that repeats an earlier one, but
@@ -100,7 +114,8 @@ impl Client {
         check_jobs(&jobs)?;
         let header = wire::SubmitChunk { header: Some(header.into()), jobs: Vec::new() };
         let chunks = std::iter::once(header).chain(Chunks { jobs: jobs.into_iter() });
-        Ok(self.stub.submit(tokio_stream::iter(chunks)).await?.into_inner().try_into()?)
+        let call = |mut stub: Stub| async move { stub.submit(tokio_stream::iter(chunks)).await };
+        Ok(self.coordinators.call(call).await?.into_inner().try_into()?)
     }
 
     /// The store, through the coordinator, over a connection of its own: a large blob does not hold up
@@ -111,30 +126,41 @@ impl Client {
 
     /// Where the coordinator's results lie; an error when it is of another version.
     pub async fn store(&mut self) -> Result<StorePlace, ServiceError> {
-        let request = wire::DescribeRequest {
-            protocol_version: PROTOCOL_VERSION,
-            code_version: CODE_VERSION.to_owned(),
-            numerics_version: NUMERICS_VERSION,
+        let describe = |mut stub: Stub| async move {
+            let request = wire::DescribeRequest {
+                protocol_version: PROTOCOL_VERSION,
+                code_version: CODE_VERSION.to_owned(),
+                numerics_version: NUMERICS_VERSION,
+            };
+            stub.describe(request).await
         };
-        Ok(self.stub.describe(request).await?.into_inner().try_into()?)
+        Ok(self.coordinators.call_any(describe).await?.into_inner().try_into()?)
     }
 
     /// The latest runs, newest first.
     pub async fn runs(&mut self) -> Result<Vec<RunSummary>, ServiceError> {
-        let runs = self.stub.runs(wire::RunsRequest {}).await?.into_inner().runs;
+        let ask = |mut stub: Stub| async move { stub.runs(wire::RunsRequest {}).await };
+        let runs = self.coordinators.call_any(ask).await?.into_inner().runs;
         Ok(runs.into_iter().map(TryInto::try_into).collect::<Result<_, _>>()?)
     }
 
     /// How far a run is, with the jobs that ended after `after`: 0 at first, then
     /// [`JobResult::ended`] of the last one seen.
     pub async fn status(&mut self, run: &RunId, after: u64) -> Result<RunStatus, ServiceError> {
-        let request = wire::StatusRequest { run: run.0.clone(), after };
-        Ok(self.stub.status(request).await?.into_inner().try_into()?)
+        let ask = |mut stub: Stub| {
+            let request = wire::StatusRequest { run: run.0.clone(), after };
+            async move { stub.status(request).await }
+        };
+        Ok(self.coordinators.call_any(ask).await?.into_inner().try_into()?)
     }
 
     /// Every job of a run, in the order of the plan.
     pub async fn results(&mut self, run: &RunId) -> Result<Vec<JobResult>, ServiceError> {
-        let mut chunks = self.stub.results(wire::ResultsRequest { run: run.0.clone() }).await?.into_inner();
+        let ask = |mut stub: Stub| {
+            let request = wire::ResultsRequest { run: run.0.clone() };
+            async move { stub.results(request).await }
+        };
+        let mut chunks = self.coordinators.call_any(ask).await?.into_inner();
         let mut results = Vec::new();
         while let Some(chunk) = chunks.next().await {
             for result in chunk?.results {
@@ -146,9 +172,24 @@ impl Client {
 
     /// Stops a run; what is done stays.
     pub async fn cancel(&mut self, run: &RunId) -> Result<(), ServiceError> {
-        self.stub.cancel(wire::CancelRequest { run: run.0.clone() }).await?;
+        let cancel = |mut stub: Stub| {
+            let request = wire::CancelRequest { run: run.0.clone() };
+            async move { stub.cancel(request).await }
+        };
+        self.coordinators.call_any(cancel).await?;
         Ok(())
     }
+}
+
+fn endpoint(url: &str) -> Result<Endpoint, ServiceError> {
+    let endpoint = Endpoint::from_shared(url.to_owned())
+        .map_err(|e| ServiceError::new(Code::Invalid, format!("\"{url}\" is no address: {e}")))?;
+    Ok(endpoint
+        .connect_timeout(CONNECT_TIMEOUT)
+        .tcp_nodelay(true)
+        .http2_keep_alive_interval(KEEP_ALIVE.0)
+        .keep_alive_timeout(KEEP_ALIVE.1)
+        .keep_alive_while_idle(true))
 }
 
 /// Jobs in chunks of about [`SUBMIT_CHUNK_BYTES`], encoded one chunk at a time.

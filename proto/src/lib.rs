@@ -23,6 +23,7 @@ mod blobs;
 mod client;
 mod convert;
 mod error;
+mod failover;
 pub mod limits;
 mod peer;
 mod report;

@@ -14,6 +14,8 @@ mod convert_rgbd;
 mod data;
 mod faults;
 mod mounts;
+#[path = "../../coordinator/tests/cluster/postgres.rs"]
+mod postgres;
 mod program;
 mod results;
 mod s3;
@@ -30,6 +32,7 @@ pub use convert_rgbd::convert_rgbd;
 pub use data::{reference_weights, shared_data};
 pub use faults::{children, is_alive, send, wait_until};
 pub use mounts::{can_mount, hiding};
+pub use postgres::Postgres;
 pub use program::{Finished, Running, program, run};
 pub use results::{blobs, confident_share, files_below};
 pub use s3::S3Server;

@@ -4,7 +4,9 @@
 use std::path::Path;
 use std::time::Duration;
 
-use planesweep_tests::{Bench, Cluster, Running, S3Server, courtyard, is_alive, run, send, wait_until};
+use planesweep_tests::{
+    Bench, Cluster, Postgres, Running, S3Server, courtyard, is_alive, run, send, wait_until,
+};
 
 /// How long a state may take to come; far above what it ever takes.
 const DEADLINE: Duration = Duration::from_mins(5);
@@ -134,6 +136,40 @@ fn a_killed_coordinator_is_restarted_and_loses_nothing() {
         .sum();
     assert_eq!(done, 25, "{status}");
     same_cloud(&bench, "calm", "struck");
+}
+
+#[test]
+fn of_two_coordinators_one_goes_and_the_workers_stay() {
+    let Some(postgres) = Postgres::start("of_two_coordinators_one_goes_and_the_workers_stay") else { return };
+    let bench = of_courtyard();
+    calm(&bench, &SLOW);
+    let start = || Cluster::start_on(&postgres.url(), &bench.path("store"), Vec::new(), &[]);
+    let (going, staying) = (start(), start());
+    let both = format!("{},{}", going.url(), staying.url());
+    let worker = ["worker", "--coordinator", &both, "--threads", "1", TORCH[0], TORCH[1]];
+    let mut workers = [Running::start(worker), Running::start(worker)];
+    let alive_at = |cluster: &Cluster| {
+        let status =
+            run(["status", "scene-1", "--coordinator", cluster.url(), "--json"]).expect_code(0).json();
+        let workers = status["workers"].as_array().expect("workers").clone();
+        workers.iter().filter(|worker| worker["alive"] == true).count()
+    };
+    let mut struck = bench.submit_to("struck", &both, &SLOW);
+    wait_for_results(&struck, 1);
+    assert_eq!((alive_at(&going), alive_at(&staying)), (2, 0));
+
+    let gone = going.drain().wait().expect_code(0);
+    assert!(!gone.stderr.contains("stopping at once"), "{}", gone.stderr);
+    assert!(struck.is_running() && workers.iter_mut().all(Running::is_running), "{}", struck.stderr());
+    assert!(wait_until(DEADLINE, || alive_at(&staying) == 2), "{}", workers[0].stderr());
+    let _ = struck.wait().expect_code(0);
+    same_cloud(&bench, "calm", "struck");
+
+    // Both have said that they go, as far as the workers know.
+    let _ = staying.drain().wait().expect_code(0);
+    for worker in workers {
+        let _ = worker.wait().expect_code(0);
+    }
 }
 
 #[test]

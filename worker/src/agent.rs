@@ -25,6 +25,7 @@ use crate::failure::JobError;
 use crate::held::Held;
 use crate::jobs::Jobs;
 use crate::maps::Maps;
+use crate::orders::{Orders, Verdict};
 use crate::store::{Store, StoreError};
 
 /// The first report asks for an answer at once, for it brings the store's address.
@@ -36,7 +37,8 @@ const RECONNECT: (Duration, Duration) = (Duration::from_millis(100), Duration::f
 
 /// What a worker is told when it starts.
 pub struct WorkerConfig {
-    /// The coordinator, such as `http://127.0.0.1:7070`.
+    /// The coordinator, such as `http://127.0.0.1:7070`; with commas between, several that share a ledger: the
+    /// worker goes on to the next when one cannot be reached or goes.
     pub coordinator: String,
     /// The token, when the coordinator wants one.
     pub token: Option<String>,
@@ -119,6 +121,7 @@ pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result
             role: config.role,
             device: config.device,
         },
+        orders: Orders::new(client.coordinators()),
         client,
         epoch: Instant::now(),
         sequence: 0,
@@ -167,6 +170,7 @@ enum Event {
 struct Agent {
     identity: Identity,
     client: Client,
+    orders: Orders,
     epoch: Instant,
     sequence: u64,
     state: WorkerState,
@@ -201,6 +205,7 @@ impl Agent {
             let report = self.report();
             let sent = Instant::now();
             let mut client = self.client.clone();
+            let coordinator = client.coordinator();
             let answer = tokio::select! {
                 biased;
                 // A job that ends is reported at once; the report under way is dropped for it.
@@ -220,6 +225,11 @@ impl Agent {
                     self.lease_ends = Some(sent + reply.lease);
                     let order = reply.order;
                     let brought_something = self.apply(reply);
+                    let verdict = self.orders.hear(coordinator, order);
+                    if verdict == Verdict::Leave && self.state == WorkerState::Ready {
+                        self.take_leave(coordinator).await;
+                        continue;
+                    }
                     if order == Order::Stop || self.state == WorkerState::Drained {
                         return Ok(());
                     }
@@ -252,6 +262,22 @@ impl Agent {
                 }
             }
         }
+    }
+
+    /// Goes on to the next coordinator. The one that goes is told not to wait for what is held here.
+    async fn take_leave(&mut self, coordinator: usize) {
+        tracing::info!("the coordinator goes, going on with the next");
+        let farewell = Report {
+            state: WorkerState::Drained,
+            free: Slots::default(),
+            max_wait: FIRST_WAIT,
+            ..self.report()
+        };
+        match self.client.clone().report(&farewell).await {
+            Ok(reply) => drop(self.apply(reply)),
+            Err(error) => tracing::debug!(%error, "the coordinator has gone already"),
+        }
+        self.client.leave(coordinator);
     }
 
     fn report(&mut self) -> Report {

@@ -28,6 +28,7 @@ mod held;
 mod images;
 mod jobs;
 mod maps;
+mod orders;
 mod weights;
 
 use planesweep_store as store;

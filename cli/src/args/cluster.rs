@@ -43,7 +43,8 @@ impl TokenArgs {
 /// How a coordinator is reached.
 #[derive(Clone, Debug, Args)]
 pub struct ConnectArgs {
-    /// The coordinator's address, such as http://10.0.0.1:7070.
+    /// The coordinator's address, such as http://10.0.0.1:7070; with commas between, several that share a
+    /// ledger, of which the next is called when one cannot be reached.
     #[arg(long, env = "PLANESWEEP_COORDINATOR", value_name = "URL")]
     pub coordinator: String,
     #[command(flatten)]
