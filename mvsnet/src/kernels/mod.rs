@@ -14,6 +14,7 @@ mod aligned;
 pub(crate) mod correlate;
 pub(crate) mod cost;
 pub(crate) mod cost_gradient;
+pub(crate) mod normalize;
 pub(crate) mod regress;
 pub(crate) mod simd;
 pub(crate) mod slab;

@@ -93,6 +93,8 @@ pub(crate) trait Simd {
     unsafe fn mul_add(a: Self::V, b: Self::V, c: Self::V) -> Self::V;
     /// The greater; `b` where a lane of `a` is no number.
     unsafe fn max(a: Self::V, b: Self::V) -> Self::V;
+    /// `v` where `gate` is positive, otherwise zero.
+    unsafe fn where_positive(gate: Self::V, v: Self::V) -> Self::V;
     /// Lanes 0, 2, 4 ... of the 32 lanes of `a`, then `b`.
     unsafe fn even(a: Self::V, b: Self::V) -> Self::V;
     /// Lanes 1, 3, 5 ... of the 32 lanes of `a`, then `b`.
@@ -155,6 +157,10 @@ mod x86 {
             _mm512_max_ps(a, b)
         }
         #[inline(always)]
+        unsafe fn where_positive(gate: __m512, v: __m512) -> __m512 {
+            _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(gate, _mm512_setzero_ps()), v)
+        }
+        #[inline(always)]
         unsafe fn even(a: __m512, b: __m512) -> __m512 {
             let lanes = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
             _mm512_permutex2var_ps(a, lanes, b)
@@ -207,6 +213,11 @@ mod x86 {
         #[inline(always)]
         unsafe fn max(a: Self::V, b: Self::V) -> Self::V {
             [_mm256_max_ps(a[0], b[0]), _mm256_max_ps(a[1], b[1])]
+        }
+        #[inline(always)]
+        unsafe fn where_positive(gate: Self::V, v: Self::V) -> Self::V {
+            let half = |gate, v| _mm256_and_ps(_mm256_cmp_ps::<_CMP_GT_OQ>(gate, _mm256_setzero_ps()), v);
+            [half(gate[0], v[0]), half(gate[1], v[1])]
         }
         #[inline(always)]
         unsafe fn even(a: Self::V, b: Self::V) -> Self::V {
@@ -273,6 +284,10 @@ impl Simd for Portable {
         std::array::from_fn(|i| if a[i] > b[i] { a[i] } else { b[i] })
     }
     #[inline(always)]
+    unsafe fn where_positive(gate: Self::V, v: Self::V) -> Self::V {
+        std::array::from_fn(|i| if gate[i] > 0.0 { v[i] } else { 0.0 })
+    }
+    #[inline(always)]
     unsafe fn even(a: Self::V, b: Self::V) -> Self::V {
         std::array::from_fn(|i| if i < 8 { a[2 * i] } else { b[2 * i - 16] })
     }
@@ -300,8 +315,9 @@ mod tests {
     unsafe fn shuffles<S: Simd>(case: &mut Case) {
         let (a, b) = (S::load(case.a.as_ptr()), S::load(case.b.as_ptr()));
         let (low, high) = S::interleave(a, b);
-        let all = [S::even(a, b), S::odd(a, b), low, high, S::max(a, b), S::sub(a, S::splat(2.0))];
-        for v in all {
+        let from_two = S::sub(a, S::splat(2.0));
+        let all = [S::even(a, b), S::odd(a, b), low, high, S::max(a, b), from_two];
+        for v in all.into_iter().chain([S::where_positive(from_two, b)]) {
             let mut out = [0.0; 16];
             S::store(out.as_mut_ptr(), v);
             case.out.push(out);
@@ -324,5 +340,6 @@ mod tests {
         assert_eq!(results[0][0][..9], [0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0, 31.0]);
         assert_eq!(results[0][2][..4], [0.0, 31.0, 1.0, 30.0]);
         assert_eq!(results[0][3][14..], [15.0, 16.0]);
+        assert_eq!(results[0][6][..5], [0.0, 0.0, 0.0, 28.0, 27.0]);
     }
 }

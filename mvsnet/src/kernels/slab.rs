@@ -4,6 +4,7 @@
 //! `[y][channel][x]`. Kernels vectorise along the last axis. Around the values lie zeros, which nobody
 //! ever overwrites, so that convolutions need no case for the border.
 use std::collections::HashMap;
+use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -84,6 +85,14 @@ impl Slab {
         &mut self.data.values_mut()[FRONT * column..(FRONT + self.shape.columns) * column]
     }
 
+    /// Some neighbouring columns.
+    pub(crate) fn columns(&self, range: Range<usize>) -> Columns<'_> {
+        let column = self.shape.column();
+        assert!(range.end <= self.shape.columns);
+        let values = &self.data.values()[(FRONT + range.start) * column..(FRONT + range.end) * column];
+        Columns { values, shape: Shape { columns: range.len(), ..self.shape } }
+    }
+
     /// One channel of one column.
     pub(crate) fn channel_mut(&mut self, column: usize, channel: usize) -> &mut [f32] {
         let shape = self.shape;
@@ -130,6 +139,24 @@ impl Column<'_> {
     /// the last stored value of the last channel.
     pub(super) fn as_ptr(&self) -> *const f32 {
         self.all[self.at..].as_ptr()
+    }
+
+    pub(super) fn shape(&self) -> Shape {
+        self.shape
+    }
+}
+
+/// Readable columns that follow each other.
+#[derive(Clone, Copy)]
+pub(crate) struct Columns<'a> {
+    values: &'a [f32],
+    shape: Shape,
+}
+
+impl Columns<'_> {
+    /// The first value of the first channel of the first column.
+    pub(super) fn as_ptr(&self) -> *const f32 {
+        self.values[COLUMN_START.min(self.values.len())..].as_ptr()
     }
 
     pub(super) fn shape(&self) -> Shape {

@@ -6,6 +6,7 @@ use nalgebra::{Matrix3, Matrix3x4, Vector3};
 use proptest::prelude::*;
 
 use super::cost::{CHANNELS, CostInput, CostScratch, FeatureMap, PixelSweep};
+use super::normalize;
 use super::regress::{RegressionLayer, RegressionScratch};
 use super::simd::Level;
 use super::slab::{Shape, Slab};
@@ -196,6 +197,60 @@ proptest! {
             let value = value + bias[o];
             (if plain { value } else { value.max(0.0) + at(&skip, 0, o, i) }, magnitude + 2.0)
         });
+    }
+
+    #[test]
+    fn normalisation_and_its_gradient_are_the_formulas(
+        columns in 1_usize..4, channels in 1_usize..9, length in 1_usize..70, skip: bool, seed: u64,
+    ) {
+        // On a grid, so that no rounding decides what ReLU lets through.
+        let gridded = |channels, seed| {
+            let mut slab = random_slab(Shape { columns, channels, length }, seed);
+            for (x, channel) in (0..columns).flat_map(|x| (0..channels).map(move |channel| (x, channel))) {
+                slab.channel_mut(x, channel).iter_mut().for_each(|value| *value = (64.0 * *value).round() / 64.0);
+            }
+            slab
+        };
+        let (z, output) = (gridded(channels, seed), gridded(channels + 1, seed ^ 1));
+        let affine: Vec<_> = (0..channels).map(|c| [0.5 * c as f32 - 1.25, 0.25 - 0.125 * c as f32]).collect();
+        let slopes: Vec<_> = (0..channels).map(|c| [0.5 + c as f32, 0.25 * c as f32, 0.75]).collect();
+        let v = |x: usize, c: usize, i: isize| {
+            f64::from(affine[c][0]) * at(&z, x as isize, c, i) + f64::from(affine[c][1])
+        };
+        let more = skip.then(|| gridded(channels, seed ^ 2));
+        let apply = |level| {
+            let mut result = Slab::zeroed(z.shape());
+            let more = more.as_ref().map(|more| more.columns(0..columns));
+            normalize::apply(level, z.columns(0..columns), more, &affine, result.columns_mut());
+            result
+        };
+        check(apply, |x, c, i| (v(x, c, i).max(0.0) + more.as_ref().map_or(0.0, |more| at(more, x as isize, c, i)), 1.0));
+        let passed = |x: usize, c: usize, i: isize| if v(x, c, i) > 0.0 { at(&output, x as isize, c, i) } else { 0.0 };
+        let gradient = |level| {
+            let mut result = Slab::zeroed(z.shape());
+            let (z, output) = (z.columns(0..columns), output.columns(0..columns));
+            normalize::gradient(level, z, output, &affine, &slopes, result.columns_mut());
+            result
+        };
+        check(gradient, |x, c, i| {
+            let [a, b, offset] = slopes[c].map(f64::from);
+            (a * passed(x, c, i) + b * at(&z, x as isize, c, i) + offset, 10.0)
+        });
+        for level in Level::available() {
+            let (all, of_output) = (z.columns(0..columns), output.columns(0..columns));
+            let sums = normalize::gradient_sums(level, all, of_output, &affine);
+            let moments = normalize::moments(level, all, channels);
+            for c in 0..channels {
+                let places = || (0..columns).flat_map(|x| (0..length as isize).map(move |i| (x, i)));
+                let total = |term: &dyn Fn(f64, f64) -> f64| {
+                    places().map(|(x, i)| term(passed(x, c, i), at(&z, x as isize, c, i))).sum::<f64>()
+                };
+                prop_assert!((sums[c][0] - total(&|g, _| g)).abs() < 1e-4);
+                prop_assert!((sums[c][1] - total(&|g, z| g * z)).abs() < 1e-4);
+                prop_assert!((moments[c][0] - total(&|_, z| z)).abs() < 1e-4);
+                prop_assert!((moments[c][1] - total(&|_, z| z * z)).abs() < 1e-4);
+            }
+        }
     }
 
     #[test]

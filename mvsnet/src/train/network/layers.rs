@@ -52,7 +52,7 @@ impl Step<'_> {
             BatchStatistics::Running => Some([part("running_mean"), part("running_var")]),
         };
         let weights = NormalizationWeights { gamma: part("weight"), beta: part("bias"), running };
-        let normalization = Normalization::new(&weights, &z);
+        let normalization = Normalization::new(&self.tools, &weights, &z);
         if let Some(measured) = &normalization.measured {
             for (part, values) in ["running_mean", "running_var"].into_iter().zip(measured) {
                 let tensor = WeightTensor { shape: vec![values.len()], values: values.clone() };
