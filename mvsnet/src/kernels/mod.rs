@@ -23,3 +23,4 @@ pub(crate) mod strided;
 mod tests;
 pub(crate) mod transposed;
 pub(crate) mod winograd;
+pub(crate) mod winograd_gradient;

@@ -150,7 +150,7 @@ unsafe fn moments_of<S: Simd>(task: &mut Moments<'_>) {
                 lanes[1] = S::mul_add(z, z, lanes[1]);
             }
         }
-        *sums = lanes.map(|lanes| total::<S>(lanes));
+        *sums = [total::<S>(lanes[0]), total::<S>(lanes[1])];
     }
 }
 
@@ -172,7 +172,7 @@ unsafe fn sums_of<S: Simd>(task: &mut Sums<'_>) {
                 lanes[1] = S::mul_add(g, z, lanes[1]);
             }
         }
-        *sums = lanes.map(|lanes| total::<S>(lanes));
+        *sums = [total::<S>(lanes[0]), total::<S>(lanes[1])];
     }
 }
 
@@ -184,8 +184,10 @@ unsafe fn gradient_of<S: Simd>(task: &mut Gradient<'_>) {
     let channels = task.slopes.len();
     for x in 0..shape.columns {
         for channel in 0..channels {
-            let [scale, shift] = (*task.affine.get_unchecked(channel)).map(|value| S::splat(value));
-            let [a, b, c] = (*task.slopes.get_unchecked(channel)).map(|value| S::splat(value));
+            let [scale, shift] = *task.affine.get_unchecked(channel);
+            let (scale, shift) = (S::splat(scale), S::splat(shift));
+            let [a, b, c] = *task.slopes.get_unchecked(channel);
+            let (a, b, c) = (S::splat(a), S::splat(b), S::splat(c));
             let z = task.z.as_ptr().add(x * shape.column() + channel * shape.stride());
             let g = task.output.as_ptr().add(x * output.column() + channel * shape.stride());
             let to = task.to.as_mut_ptr().add((x * channels + channel) * shape.stride() + COLUMN_START);

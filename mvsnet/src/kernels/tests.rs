@@ -2,17 +2,21 @@
 //!
 //! The levels with fused multiply-add must also agree with each other to the bit.
 
+use std::sync::Arc;
+
 use nalgebra::{Matrix3, Matrix3x4, Vector3};
 use proptest::prelude::*;
 
 use super::cost::{CHANNELS, CostInput, CostScratch, FeatureMap, PixelSweep};
 use super::normalize;
 use super::regress::{RegressionLayer, RegressionScratch};
-use super::simd::Level;
+use super::simd::{LANES, Level};
 use super::slab::{Shape, Slab};
 use super::strided::StridedLayer;
 use super::transposed::TransposedLayer;
+
 use super::winograd::{Target, WinogradLayer};
+use super::winograd_gradient::{ProductScratch, WinogradProducts, taps};
 use crate::CostMetric;
 use crate::weights::uniform;
 
@@ -197,6 +201,50 @@ proptest! {
             let value = value + bias[o];
             (if plain { value } else { value.max(0.0) + at(&skip, 0, o, i) }, magnitude + 2.0)
         });
+    }
+
+    #[test]
+    fn products_make_the_gradient_of_the_kernel(
+        slabs in 1_usize..4, columns in 1_usize..7, length in 1_usize..100, inputs in 1_usize..4, volume: bool,
+        seed: u64,
+    ) {
+        let (inputs, outputs, rows) = (inputs * LANES, 8, if volume { 3 } else { 1 });
+        let stack = |channels, seed| -> Vec<_> {
+            let shape = Shape { columns, channels, length };
+            (0..slabs as u64).map(|slab| Arc::new(random_slab(shape, seed ^ (slab << 8)))).collect()
+        };
+        let (input, gradient) = (stack(inputs, seed), stack(outputs, seed ^ 1));
+        let products = WinogradProducts { input: &input, gradient: &gradient, rows };
+        let (o, c) = (seed as usize % outputs, seed as usize / 8 % inputs);
+        let mut scratch = ProductScratch::default();
+        let mut results = Vec::new();
+        for level in Level::available() {
+            let (half, end) = (products.vectors() / 2, products.vectors());
+            let parts = [0..half, half..end].map(|vectors| products.sums(level, vectors, &mut scratch));
+            for row in 0..rows {
+                let taps = taps(|product| {
+                    let at = (((product * rows + row) * inputs + c / LANES * LANES) * outputs) / LANES + o;
+                    parts.iter().map(|sums| f64::from(sums[at * LANES + c % LANES])).sum()
+                });
+                for (column, k) in (0..9).map(|tap| (tap / 3, tap % 3)) {
+                    let places = (0..slabs).flat_map(|y| (0..columns).map(move |x| (y, x)));
+                    let places = places.flat_map(|(y, x)| (0..length as isize).map(move |i| (y, x, i)));
+                    let (value, magnitude) = sum(places.map(|(y, x, i)| {
+                        let row = y as isize + if volume { row as isize - 1 } else { 0 };
+                        let Some(slab) = usize::try_from(row).ok().and_then(|row| input.get(row)) else {
+                            return 0.0;
+                        };
+                        let (x_at, i_at) = ((x + column) as isize - 1, i + k as isize - 1);
+                        at(&gradient[y], x as isize, o, i) * at(slab, x_at, c, i_at)
+                    }));
+                    prop_assert!((taps[column][k] - value).abs() <= 4e-6 * (magnitude + 1.0));
+                }
+            }
+            results.push(parts);
+        }
+        for pair in results[1..].windows(2) {
+            prop_assert_eq!(&pair[0], &pair[1]);
+        }
     }
 
     #[test]

@@ -12,7 +12,7 @@ use super::simd::{LANES, Level, Simd, by_level};
 use super::slab::{COLUMN_START, Column, Shape};
 
 /// Products for a 2x2 block of outputs.
-const PRODUCTS: usize = 16;
+pub(super) const PRODUCTS: usize = 16;
 /// Vectors of pairs computed at a time, at most.
 const MAX_BLOCK: usize = 3;
 
@@ -199,7 +199,7 @@ unsafe fn block<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(task: &mut 
 
 /// `B^T d B` of 16 blocks of 4x4 inputs, one per lane; product `4 * column + k` goes to `product * step`.
 #[inline(always)]
-unsafe fn transform<S: Simd>(from: [*const f32; 4], to: *mut f32, step: usize) {
+pub(super) unsafe fn transform<S: Simd>(from: [*const f32; 4], to: *mut f32, step: usize) {
     let t0 = along::<S>(from[0]);
     let t1 = along::<S>(from[1]);
     let t2 = along::<S>(from[2]);

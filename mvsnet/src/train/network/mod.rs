@@ -5,6 +5,7 @@
 //! warped feature is ever stored.
 
 mod convolution;
+mod kernel_gradient;
 mod layers;
 mod normalization;
 mod regression;
