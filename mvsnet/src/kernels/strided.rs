@@ -93,35 +93,55 @@ by_level!(run(task: &Task<'_>) = column[8, 2][4, 1]);
 /// As [`Simd`]; the sizes are those `apply` checks. A vector of outputs reads at most 36 values from twice
 /// its place, and outputs are stored up to at most 32 beyond half the input's: within what `Column` allows.
 #[inline(always)]
-unsafe fn column<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(task: &Task<'_>) {
+unsafe fn column<S: Simd, const OUTPUTS: usize, const WIDEST: usize>(task: &Task<'_>) {
+    for output in (0..task.layer.outputs).step_by(OUTPUTS) {
+        let mut begin = 0;
+        while begin < task.to.length {
+            if WIDEST >= 2 && task.to.length > begin + LANES {
+                block::<S, OUTPUTS, 2>(task, output, begin);
+                begin += 2 * LANES;
+            } else {
+                block::<S, OUTPUTS, 1>(task, output, begin);
+                begin += LANES;
+            }
+        }
+        for o in 0..OUTPUTS {
+            let to = task.output.add((output + o) * task.to.stride() + COLUMN_START);
+            for beyond in task.to.length..task.to.padded() {
+                *to.add(beyond) = 0.0;
+            }
+        }
+    }
+}
+
+/// `VECTORS` vectors of some outputs.
+#[inline(always)]
+unsafe fn block<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(
+    task: &Task<'_>,
+    output: usize,
+    begin: usize,
+) {
     let layer = task.layer;
-    for output in (0..layer.outputs).step_by(OUTPUTS) {
-        for begin in (0..task.to.padded()).step_by(VECTORS * LANES) {
-            let mut sums = [[S::splat(0.0); VECTORS]; OUTPUTS];
-            for o in 0..OUTPUTS {
-                sums[o] = [S::splat(*layer.bias.get_unchecked(output + o)); VECTORS];
-            }
-            for (column, tap) in task.input {
-                let from = column.as_ptr().add(2 * begin).sub(layer.size / 2);
-                let weights = layer.weights.get_unchecked(*tap).values().as_ptr();
-                let weights = weights.add(output * layer.inputs * layer.size);
-                if layer.size == 3 {
-                    sums = tap_sums::<S, OUTPUTS, VECTORS, 3>(task, from, weights, sums);
-                } else {
-                    sums = tap_sums::<S, OUTPUTS, VECTORS, 5>(task, from, weights, sums);
-                }
-            }
-            for o in 0..OUTPUTS {
-                let to = task.output.add((output + o) * task.to.stride() + COLUMN_START + begin);
-                for v in 0..VECTORS {
-                    let sum = sums[o][v];
-                    let sum = if layer.relu { S::max(sum, S::splat(0.0)) } else { sum };
-                    S::store(to.add(v * LANES), sum);
-                }
-                for beyond in task.to.length.max(begin)..begin + VECTORS * LANES {
-                    *to.add(beyond - begin) = 0.0;
-                }
-            }
+    let mut sums = [[S::splat(0.0); VECTORS]; OUTPUTS];
+    for o in 0..OUTPUTS {
+        sums[o] = [S::splat(*layer.bias.get_unchecked(output + o)); VECTORS];
+    }
+    for (column, tap) in task.input {
+        let from = column.as_ptr().add(2 * begin).sub(layer.size / 2);
+        let weights = layer.weights.get_unchecked(*tap).values().as_ptr();
+        let weights = weights.add(output * layer.inputs * layer.size);
+        if layer.size == 3 {
+            sums = tap_sums::<S, OUTPUTS, VECTORS, 3>(task, from, weights, sums);
+        } else {
+            sums = tap_sums::<S, OUTPUTS, VECTORS, 5>(task, from, weights, sums);
+        }
+    }
+    for o in 0..OUTPUTS {
+        let to = task.output.add((output + o) * task.to.stride() + COLUMN_START + begin);
+        for v in 0..VECTORS {
+            let sum = sums[o][v];
+            let sum = if layer.relu { S::max(sum, S::splat(0.0)) } else { sum };
+            S::store(to.add(v * LANES), sum);
         }
     }
 }
