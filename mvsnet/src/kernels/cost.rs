@@ -104,18 +104,32 @@ pub(crate) struct CostInput<'a> {
 /// outside; five parts, each of the padded number of depths.
 pub(super) type Samples = Vec<f32>;
 
-/// Memory for the samples of one pixel.
+/// Memory for one pixel.
 #[derive(Debug, Default)]
-pub(crate) struct CostScratch(Vec<Samples>);
+pub(crate) struct CostScratch {
+    samples: Vec<Samples>,
+    differences: Vec<f32>,
+}
 
 impl CostScratch {
     /// For this many sources and (padded) depths.
     pub(super) fn samples(&mut self, sources: usize, padded: usize) -> &mut [Samples] {
-        self.0.resize_with(sources, Samples::default);
-        for samples in &mut self.0 {
+        self.samples.resize_with(sources, Samples::default);
+        for samples in &mut self.samples {
             samples.resize(5 * padded, 0.0);
         }
-        &mut self.0
+        &mut self.samples
+    }
+
+    /// The same, and a feature for each source.
+    pub(super) fn samples_and_differences(
+        &mut self,
+        sources: usize,
+        padded: usize,
+    ) -> (&mut [Samples], &mut [f32]) {
+        self.differences.resize(sources * CHANNELS, 0.0);
+        self.samples(sources, padded);
+        (&mut self.samples, &mut self.differences)
     }
 }
 

@@ -44,6 +44,11 @@ impl Shape {
         self.channels * self.stride()
     }
 
+    /// Where a value of a writable column lies.
+    pub(crate) fn value(self, channel: usize, at: usize) -> usize {
+        COLUMN_START + channel * self.stride() + at
+    }
+
     /// Bytes of a slab.
     pub(crate) fn bytes(self) -> usize {
         self.floats() * size_of::<f32>()

@@ -1,10 +1,13 @@
 //! Convolutions forward, and what the gradient of their output says of input and kernel.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use super::stack::{Stack, Tools};
 use crate::WeightTensor;
-use crate::bands::{PlainStage, taps};
+use crate::bands::{PlainStage, Row, taps};
+use crate::kernels::regress::RegressionLayer;
 use crate::kernels::slab::Shape;
 use crate::kernels::strided::StridedLayer;
 use crate::kernels::transposed::TransposedLayer;
@@ -82,12 +85,7 @@ impl<'a> Convolution<'a> {
 
     pub(super) fn forward(&self, tools: &Tools, input: &Stack) -> Stack {
         match self.sizes {
-            Sizes::Same => {
-                let kernel = |o, i, row, column, k| self.weight(o, i, row, column, k);
-                let sizes = [self.inputs, self.outputs, self.rows()];
-                let layer = WinogradLayer::new(tools.level, sizes, kernel, &self.bias, false);
-                same(tools, &layer, input, self.volume)
-            }
+            Sizes::Same => same(tools, &self.plain(tools), input, self.volume),
             Sizes::Halved => {
                 let kernel = |o, i, tap, k| self.weight(o, i, tap / 3, tap % 3, k);
                 let image_kernel = |o, i, tap, k| self.weight(o, i, 0, tap, k);
@@ -108,6 +106,70 @@ impl<'a> Convolution<'a> {
         }
     }
 
+    /// The output of a volume whose rows are made when they are needed, a few at a time, and those rows.
+    ///
+    /// Only for layers that keep sizes.
+    pub(super) fn forward_by_bands(
+        &self,
+        tools: &Tools,
+        (shape, height): (Shape, usize),
+        band: usize,
+        rows: impl Fn(Range<usize>) -> Vec<Row>,
+    ) -> (Stack, Stack) {
+        let layer = self.plain(tools);
+        let mut stage = PlainStage::new(&tools.pool, &layer, shape, height);
+        let (mut input, mut output) = (Vec::with_capacity(height), Vec::with_capacity(height));
+        for begin in (0..height).step_by(band) {
+            let rows = rows(begin..(begin + band).min(height));
+            output.extend(stage.push(&layer, &rows));
+            input.extend(rows);
+        }
+        (Stack::new(input), Stack::new(output))
+    }
+
+    /// Hands out the gradient of the input, a few rows at a time.
+    ///
+    /// Only for layers of volumes that keep sizes.
+    pub(super) fn input_gradient_by_bands(
+        &self,
+        tools: &Tools,
+        gradient: &Stack,
+        band: usize,
+        mut take: impl FnMut(&[Row]),
+    ) {
+        let layer = self.mirrored(tools, gradient.shape);
+        let mut stage = PlainStage::new(&tools.pool, &layer, gradient.shape, gradient.slabs.len());
+        for rows in gradient.slabs.chunks(band) {
+            take(&stage.push(&layer, rows));
+        }
+    }
+
+    /// The kernels of a layer that keeps sizes.
+    fn plain(&self, tools: &Tools) -> WinogradLayer {
+        let kernel = |o, i, row, column, k| self.weight(o, i, row, column, k);
+        WinogradLayer::new(tools.level, [self.inputs, self.outputs, self.rows()], kernel, &self.bias, false)
+    }
+
+    /// The kernel of the last layer of the regularisation, with its bias.
+    pub(super) fn regression(&self, tools: &Tools) -> RegressionLayer {
+        let kernel = |input, row, column, k| self.weight(0, input, row, column, k);
+        RegressionLayer::new(tools.level, kernel, self.bias[0])
+    }
+
+    /// The kernels of its way back, from a gradient of this shape.
+    fn mirrored(&self, tools: &Tools, gradient: Shape) -> WinogradLayer {
+        let last = self.size - 1;
+        let kernel = |i, o, row, column, k| {
+            if o >= self.outputs {
+                return 0.0;
+            }
+            let row = if self.volume { last - row } else { 0 };
+            self.weight(o, i, row, last - column, last - k)
+        };
+        let sizes = [gradient.channels, self.inputs, self.rows()];
+        WinogradLayer::new(tools.level, sizes, kernel, &vec![0.0; self.inputs], false)
+    }
+
     fn taps(&self) -> usize {
         if self.volume { 9 } else { self.size }
     }
@@ -122,18 +184,7 @@ impl<'a> Convolution<'a> {
     ) -> Stack {
         match self.sizes {
             Sizes::Same => {
-                let last = self.size - 1;
-                let kernel = |i, o, row, column, k| {
-                    if o >= self.outputs {
-                        return 0.0;
-                    }
-                    let row = if self.volume { last - row } else { 0 };
-                    self.weight(o, i, row, last - column, last - k)
-                };
-                let sizes = [gradient.shape.channels, self.inputs, self.rows()];
-                let bias = vec![0.0; self.inputs];
-                let layer = WinogradLayer::new(tools.level, sizes, kernel, &bias, false);
-                let mut result = same(tools, &layer, gradient, self.volume);
+                let mut result = same(tools, &self.mirrored(tools, gradient.shape), gradient, self.volume);
                 if let Some(more) = more {
                     add(&mut result, more);
                 }

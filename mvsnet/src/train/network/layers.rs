@@ -1,9 +1,13 @@
 //! Layers with their weights: forward, remembering what the gradient needs, and backward.
 
+use std::ops::Range;
+
 use super::convolution::{Convolution, Sizes, bias_gradient};
 use super::normalization::{Normalization, NormalizationWeights};
+use super::regression::Regression;
 use super::stack::{Stack, Tools};
 use crate::WeightTensor;
+use crate::bands::Row;
 use crate::blocks::{self, contracted, expanded};
 use crate::kernels::slab::Shape;
 use crate::train::engine::BatchStatistics;
@@ -34,7 +38,7 @@ pub(super) struct Biased {
     input: Stack,
 }
 
-impl Step<'_> {
+impl<'a> Step<'a> {
     /// Runs a layer and gives its output, with `more` added.
     pub(super) fn normalized(
         &mut self,
@@ -46,6 +50,31 @@ impl Step<'_> {
     ) -> (Normalized, Stack) {
         let kernel = Convolution::new(sizes, &self.weights[&format!("{convolution}.weight")], None);
         let z = kernel.forward(&self.tools, &input);
+        self.normalized_from(convolution, batch_norm, sizes, (input, z), more)
+    }
+
+    /// The same for a layer that keeps sizes, of a volume whose rows are made when they are needed.
+    pub(super) fn normalized_by_bands(
+        &mut self,
+        convolution: &str,
+        batch_norm: &str,
+        volume: (Shape, usize),
+        band: usize,
+        rows: impl Fn(Range<usize>) -> Vec<Row>,
+    ) -> (Normalized, Stack) {
+        let kernel = Convolution::new(Sizes::Same, &self.weights[&format!("{convolution}.weight")], None);
+        let (input, z) = kernel.forward_by_bands(&self.tools, volume, band, rows);
+        self.normalized_from(convolution, batch_norm, Sizes::Same, (input, z), None)
+    }
+
+    fn normalized_from(
+        &mut self,
+        convolution: &str,
+        batch_norm: &str,
+        sizes: Sizes,
+        (input, z): (Stack, Stack),
+        more: Option<&Stack>,
+    ) -> (Normalized, Stack) {
         let part = |part: &str| &self.weights[&format!("{batch_norm}.{part}")];
         let running = match self.statistics {
             BatchStatistics::Own => None,
@@ -73,15 +102,34 @@ impl Step<'_> {
         wanted: bool,
         more: Option<&Stack>,
     ) -> Option<Stack> {
+        let shape = fitting(layer.input.shape);
+        let (kernel, gradient) = self.back_to_kernel(layer, gradient);
+        wanted.then(|| kernel.input_gradient(&self.tools, &gradient, shape, more))
+    }
+
+    /// The same for a layer of a volume that keeps sizes, whose input's gradient is handed out a few rows at a time.
+    pub(super) fn back_normalized_by_bands(
+        &mut self,
+        layer: Normalized,
+        gradient: &Stack,
+        band: usize,
+        take: impl FnMut(&[Row]),
+    ) {
+        let (kernel, gradient) = self.back_to_kernel(layer, gradient);
+        kernel.input_gradient_by_bands(&self.tools, &gradient, band, take);
+    }
+
+    /// Goes back to the convolution and its kernel: gives the gradient of its output.
+    fn back_to_kernel(&mut self, layer: Normalized, gradient: &Stack) -> (Convolution<'a>, Stack) {
         let Normalized { convolution, batch_norm, sizes, input, z, normalization } = layer;
         let (gradient, [gamma, beta]) = normalization.gradient(&self.tools, &z, gradient);
         drop(z);
         let name = format!("{convolution}.weight");
         let kernel = Convolution::new(sizes, &self.weights[&name], None);
-        self.gradients.insert(name.clone(), kernel.kernel_gradient(&self.tools, &input, &gradient));
+        self.gradients.insert(name, kernel.kernel_gradient(&self.tools, &input, &gradient));
         self.gradients.insert(format!("{batch_norm}.weight"), gamma);
         self.gradients.insert(format!("{batch_norm}.bias"), beta);
-        wanted.then(|| kernel.input_gradient(&self.tools, &gradient, fitting(input.shape), more))
+        (kernel, gradient)
     }
 
     /// Runs a convolution with a bias.
@@ -90,6 +138,15 @@ impl Step<'_> {
             (&self.weights[&format!("{name}.weight")], &self.weights[&format!("{name}.bias")]);
         let output = Convolution::new(Sizes::Same, kernel, Some(bias)).forward(&self.tools, &input);
         (Biased { name: name.to_owned(), input }, output)
+    }
+
+    /// Runs the last layer of the regularisation, and the regression.
+    pub(super) fn regressed(&self, name: &str, input: Stack) -> (Biased, Regression) {
+        let (kernel, bias) =
+            (&self.weights[&format!("{name}.weight")], &self.weights[&format!("{name}.bias")]);
+        let layer = Convolution::new(Sizes::Same, kernel, Some(bias)).regression(&self.tools);
+        let regression = Regression::new(&self.tools, &layer, &input);
+        (Biased { name: name.to_owned(), input }, regression)
     }
 
     /// Runs the single layer of features over the blocks of images.

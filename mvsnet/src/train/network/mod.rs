@@ -5,6 +5,7 @@
 //! warped feature is ever stored.
 
 mod convolution;
+mod cost;
 mod kernel_gradient;
 mod layers;
 mod normalization;
@@ -17,22 +18,21 @@ use rayon::prelude::*;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
 use self::convolution::Sizes;
+use self::cost::CostGradient;
 use self::layers::{Biased, Normalized, Step};
 use self::regression::{Regression, loss};
 use self::stack::{Stack, Tools};
 use super::Example;
 use super::engine::{EngineError, Gradient, GradientEngine, GradientOptions, IntervalErrors};
 use super::parameters::Tensors;
+use crate::bands::Row;
 use crate::blocks::blocks;
 use crate::input::InputImage;
-use crate::kernels::cost::{CHANNELS, CostInput, CostScratch, FeatureMap, PixelSweep};
-use crate::kernels::cost_gradient::FeatureGradients;
+use crate::kernels::cost::{CostInput, FeatureMap};
 use crate::kernels::simd::Level;
 use crate::kernels::slab::{Pool, Shape};
 use crate::{FeatureNetwork, Refinement};
 
-/// Parts that the gradient of the cost volume is summed in, whatever the number of threads.
-const STRIPS: usize = 8;
 /// Memory that is kept for the next step, at most: samples of other sizes need slabs of other shapes.
 const MOST_KEPT_BYTES: usize = 4 << 30;
 /// The layer of a feature network that has one, and the last of one that has eight.
@@ -83,18 +83,8 @@ fn run(mut step: Step<'_>, example: &Example, options: &GradientOptions) -> Grad
     let maps: Vec<FeatureMap> = features.slabs.par_iter().map(|slab| FeatureMap::new(slab)).collect();
     let shape = features.shape;
     drop(features);
-    let input = cost_input(&maps, example, options);
-    let depths = input.inverse_depths.len();
-    let volume_shape = Shape { columns: maps[0].width(), channels: CHANNELS, length: depths };
-    let volume = Stack::compute(&tools, maps[0].height(), volume_shape, |y, slab| {
-        let mut scratch = CostScratch::default();
-        for (x, column) in slab.columns_mut().chunks_exact_mut(volume_shape.column()).enumerate() {
-            input.column(tools.level, x, y, column, &mut scratch);
-        }
-    });
-    let (regularization, logits) = regularized(&mut step, volume);
-    let regression = Regression::new(&tools, &logits);
-    drop(logits);
+    let input = cost::input(&maps, example, options);
+    let (regularization, regression) = regularized(&mut step, &input);
 
     let (mut total, mut index_gradient) = loss(&regression.index, &example.truth, options.loss, 1.0);
     let errors =
@@ -107,10 +97,9 @@ fn run(mut step: Step<'_>, example: &Example, options: &GradientOptions) -> Grad
         index_gradient.iter_mut().zip(gradient).for_each(|(to, more)| *to += more);
     }
     let gradient = regression.gradient(&tools, &index_gradient);
-    let volume_gradient = back_regularized(&mut step, regularization, &gradient);
-    let feature_gradient = back_cost(&tools, &input, &volume_gradient, shape);
-    drop(volume_gradient);
-    back_features(&mut step, feature_layers, &feature_gradient);
+    let mut cost_gradient = CostGradient::new(&tools, &input);
+    back_regularized(&mut step, regularization, &gradient, |rows| cost_gradient.take(rows));
+    back_features(&mut step, feature_layers, &cost_gradient.features(shape));
     Gradient {
         loss: total,
         initial: errors(&regression.index),
@@ -168,57 +157,27 @@ fn back_features(step: &mut Step<'_>, layers: FeatureLayers, gradient: &Stack) {
     }
 }
 
-fn cost_input<'a>(maps: &'a [FeatureMap], example: &Example, options: &GradientOptions) -> CostInput<'a> {
-    let sweep = |source| {
-        let sweep = PixelSweep::new(&example.projections[0], source);
-        sweep.expect("examples have invertible references")
-    };
-    CostInput {
-        reference: &maps[0],
-        sources: maps[1..].iter().zip(example.projections[1..].iter().map(sweep)).collect(),
-        inverse_depths: example.hypotheses.depths().iter().map(|depth| 1.0 / depth).collect(),
-        metric: options.network.metric,
-    }
-}
-
-/// The gradient of all features, one slab for each view.
-fn back_cost(tools: &Tools, input: &CostInput<'_>, gradient: &Stack, shape: Shape) -> Stack {
-    let views = input.sources.len() + 1;
-    let height = gradient.slabs.len();
-    let strips = STRIPS.min(height);
-    let strip = |strip: usize| {
-        let mut gradients = FeatureGradients::zeroed(input.reference, views);
-        let mut scratch = CostScratch::default();
-        for y in strip * height / strips..(strip + 1) * height / strips {
-            for x in 0..gradient.shape.columns {
-                let column = gradient.slabs[y].column(x as isize);
-                input.column_gradient(tools.level, [x, y], column, &mut scratch, &mut gradients);
-            }
-        }
-        gradients
-    };
-    let mut parts: Vec<FeatureGradients> = (0..strips).into_par_iter().map(strip).collect();
-    let mut sum = parts.remove(0);
-    for part in &parts {
-        sum.add(part);
-    }
-    Stack::compute(tools, views, shape, |view, slab| sum.write(view, slab))
-}
-
 /// The layers of the regularisation, in the order they ran.
 struct Regularization {
-    /// conv0 to conv6.
+    /// Whose input is the cost volume.
+    first: Normalized,
+    /// conv1 to conv6.
     down: Vec<Normalized>,
     /// conv7, conv9 and conv11.
     up: Vec<Normalized>,
     prob: Biased,
 }
 
-fn regularized(step: &mut Step<'_>, volume: Stack) -> (Regularization, Stack) {
+fn regularized(step: &mut Step<'_>, cost: &CostInput<'_>) -> (Regularization, Regression) {
+    let tools = step.tools.clone();
+    let name = "cost_regularization.conv0";
+    let (convolution, batch_norm) = (format!("{name}.conv"), format!("{name}.bn"));
+    let volume = (cost::shape(cost), cost.reference.height());
+    let rows = |rows| cost::rows(&tools, cost, rows);
+    let (first, mut x) = step.normalized_by_bands(&convolution, &batch_norm, volume, cost::BAND, rows);
     let mut down = Vec::new();
     let mut skips = Vec::new();
-    let mut x = volume;
-    for i in 0..7 {
+    for i in 1..7 {
         let name = format!("cost_regularization.conv{i}");
         let sizes = if i % 2 == 1 { Sizes::Halved } else { Sizes::Same };
         if sizes == Sizes::Halved {
@@ -237,13 +196,13 @@ fn regularized(step: &mut Step<'_>, volume: Stack) -> (Regularization, Stack) {
         up.push(layer);
         x = output;
     }
-    let (prob, logits) = step.biased("cost_regularization.prob", x);
-    (Regularization { down, up, prob }, logits)
+    let (prob, regression) = step.regressed("cost_regularization.prob", x);
+    (Regularization { first, down, up, prob }, regression)
 }
 
-/// The gradient of the volume.
-fn back_regularized(step: &mut Step<'_>, layers: Regularization, logits: &Stack) -> Stack {
-    let Regularization { down, up, prob } = layers;
+/// Hands out the gradient of the volume, a few rows at a time.
+fn back_regularized(step: &mut Step<'_>, layers: Regularization, logits: &Stack, take: impl FnMut(&[Row])) {
+    let Regularization { first, down, up, prob } = layers;
     let wanted = "inner layers have gradients";
     let mut gradient = step.back_biased(prob, logits);
     // What each skip connection brings back, the largest volume first.
@@ -255,10 +214,10 @@ fn back_regularized(step: &mut Step<'_>, layers: Regularization, logits: &Stack)
     }
     for (i, layer) in down.into_iter().enumerate().rev() {
         // Layers that halve had the skip's volume as input.
-        let skip = if i % 2 == 1 { skips.pop() } else { None };
+        let skip = if i % 2 == 0 { skips.pop() } else { None };
         gradient = step.back_normalized(layer, &gradient, true, skip.as_ref()).expect(wanted);
     }
-    gradient
+    step.back_normalized_by_bands(first, &gradient, cost::BAND, take);
 }
 
 /// Refined indices, the gradient of the initial ones, and the loss of the refined ones.

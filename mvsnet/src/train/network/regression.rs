@@ -1,49 +1,53 @@
 //! Softmax, expectation and loss (paper sections 3.3 and 3.4), and the gradient of the logits.
 
+use std::sync::Arc;
+
 use planesweep_scene::Raster;
 use rayon::prelude::*;
 
 use super::stack::{Stack, Tools};
+use crate::kernels::regress::{RegressionLayer, RegressionScratch};
 use crate::kernels::slab::Shape;
 use crate::train::LossConfig;
 
 /// The probabilities over depth with their expectation.
 pub(super) struct Regression {
-    /// One channel of probabilities; columns are x, slabs y.
+    /// One channel; columns are x, slabs y.
     probability: Stack,
     /// The expected index of the hypothesis at each pixel, row by row.
     pub(super) index: Vec<f64>,
 }
 
 impl Regression {
-    /// From logits, which are the first channel.
-    pub(super) fn new(tools: &Tools, logits: &Stack) -> Self {
-        let shape = Shape { channels: 1, ..logits.shape };
-        let probability = Stack::compute(tools, logits.slabs.len(), shape, |y, slab| {
-            for x in 0..shape.columns {
-                let logits = logits.slabs[y].channel(x, 0);
-                let greatest = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-                let values = slab.channel_mut(x, 0);
-                let mut total = 0.0_f64;
-                for (value, logit) in values.iter_mut().zip(logits) {
-                    *value = (logit - greatest).exp();
-                    total += f64::from(*value);
-                }
-                let share = (1.0 / total) as f32;
-                for value in values {
-                    *value *= share;
+    /// From the input of the last layer.
+    pub(super) fn new(tools: &Tools, layer: &RegressionLayer, input: &Stack) -> Self {
+        let shape = Shape { channels: 1, ..input.shape };
+        let row = |y: usize| {
+            let mut scratch = RegressionScratch::new(shape.padded());
+            let mut probability = tools.pool.take(shape);
+            let mut index = Vec::with_capacity(shape.columns);
+            for x in (0..shape.columns).step_by(2) {
+                let rows = (0..3).filter_map(|tap| {
+                    let slab = input.slabs.get((y + tap).checked_sub(1)?)?;
+                    // Beyond the last column there is one of zeros.
+                    let column =
+                        |offset: isize| slab.column((x as isize + offset).min(shape.columns as isize));
+                    Some(([-1, 0, 1, 2].map(column), tap))
+                });
+                let pixels = layer.apply(&rows.collect::<Vec<_>>(), 1, &mut scratch);
+                for (pixel, regressed) in pixels.iter().enumerate().take(shape.columns - x) {
+                    index.push(regressed.index);
+                    let exponentials = &scratch.exponentials(pixel)[..shape.length];
+                    let share =
+                        (1.0 / exponentials.iter().map(|value| f64::from(*value)).sum::<f64>()) as f32;
+                    let values = probability.channel_mut(x + pixel, 0).iter_mut().zip(exponentials);
+                    values.for_each(|(value, exponential)| *value = exponential * share);
                 }
             }
-        });
-        let index = (0..logits.slabs.len()).into_par_iter().flat_map_iter(|y| {
-            let slab = &probability.slabs[y];
-            (0..shape.columns).map(move |x| {
-                let terms = slab.channel(x, 0).iter().zip(0_u32..);
-                terms.map(|(p, k)| f64::from(*p) * f64::from(k)).sum::<f64>()
-            })
-        });
-        let index = index.collect();
-        Self { probability, index }
+            (Arc::new(probability), index)
+        };
+        let (slabs, index): (Vec<_>, Vec<_>) = (0..input.slabs.len()).into_par_iter().map(row).unzip();
+        Self { probability: Stack::new(slabs), index: index.concat() }
     }
 
     /// The gradient of the logits from that of the expected indices.
