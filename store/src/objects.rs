@@ -39,13 +39,16 @@ impl Objects {
         Ok(Self { objects: address::open(url, variables, IfAbsent::Make)?, url: url.to_owned() })
     }
 
-    /// The store at this address, if it says that it is this one. A folder is not made: another host has
-    /// another one under the same path.
+    /// The store at this address, if it says that it is this one and may be written to. A folder is not made:
+    /// another host has another one under the same path.
     pub(crate) async fn find(url: &str, identity: &str) -> Result<Self, StoreError> {
         let objects = address::open(url, std::env::vars(), IfAbsent::Refuse)?;
         let found = Self { objects, url: url.to_owned() };
         match found.said_identity().await? {
-            Some(said) if said == identity => Ok(found),
+            Some(said) if said == identity => {
+                found.say_identity(identity).await?;
+                Ok(found)
+            }
             said => {
                 let problem = if said.is_some() { "another store is there" } else { "no store is there" };
                 Err(StoreError::Open { url: url.to_owned(), problem: problem.to_owned() })
@@ -63,10 +66,14 @@ impl Objects {
         if let Some(said) = self.said_identity().await? {
             return Ok(said);
         }
-        let written = self.objects.put(&Path::from(IDENTITY), new.to_owned().into()).await;
-        written.map_err(|error| self.cannot_open(&error))?;
+        self.say_identity(new).await?;
         // Another coordinator may have done the same.
         Ok(self.said_identity().await?.unwrap_or_else(|| new.to_owned()))
+    }
+
+    async fn say_identity(&self, identity: &str) -> Result<(), StoreError> {
+        let written = self.objects.put(&Path::from(IDENTITY), identity.to_owned().into()).await;
+        written.map(|_| ()).map_err(|error| self.cannot_open(&error))
     }
 
     async fn said_identity(&self) -> Result<Option<String>, StoreError> {

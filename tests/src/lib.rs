@@ -31,7 +31,7 @@ pub use convert_middlebury::{Bounds, convert_middlebury};
 pub use convert_rgbd::convert_rgbd;
 pub use data::{reference_weights, shared_data};
 pub use faults::{children, is_alive, send, wait_until};
-pub use mounts::{can_mount, hiding};
+pub use mounts::{can_mount, hiding, mounted};
 pub use postgres::Postgres;
 pub use program::{Finished, Running, program, run};
 pub use results::{blobs, confident_share, files_below};

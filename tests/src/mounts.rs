@@ -1,4 +1,4 @@
-//! Folders that a process does not see although others do.
+//! Folders that one process sees otherwise than all others.
 
 use std::process::Command;
 
@@ -14,7 +14,12 @@ pub fn can_mount(test: &str) -> bool {
 
 /// A shell script that starts `"$0" "$@"` where these folders are empty.
 pub fn hiding(folders: &[&str]) -> String {
-    let mounts: Vec<String> =
-        folders.iter().map(|folder| format!("mount -t tmpfs tmpfs {folder} || exit 9; ")).collect();
+    let mounts: Vec<String> = folders.iter().map(|folder| format!("mount -t tmpfs tmpfs {folder}")).collect();
+    mounted(&mounts)
+}
+
+/// A shell script that starts `"$0" "$@"` where these commands have mounted something.
+pub fn mounted<S: AsRef<str>>(mounts: &[S]) -> String {
+    let mounts: Vec<String> = mounts.iter().map(|mount| format!("{} || exit 9; ", mount.as_ref())).collect();
     format!("exec unshare -m sh -c '{}exec \"$0\" \"$@\"' \"$0\" \"$@\"", mounts.concat())
 }

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use planesweep_plan::BlobKey;
 use planesweep_tests::{
-    Bench, Cluster, Finished, Running, can_mount, courtyard, files_below, hiding, plane_of_size, send,
-    wait_until,
+    Bench, Cluster, Finished, Running, can_mount, courtyard, files_below, hiding, mounted, plane_of_size,
+    send, wait_until,
 };
 
 /// How long a state may take to come; far above what it ever takes.
@@ -21,7 +21,11 @@ const TERMINATED: i32 = 75;
 
 /// Starts a worker that sees neither the photographs nor the store, and keeps what it gets in the folder `cache`.
 fn blind_worker(bench: &Bench, cluster: &Cluster, more: &[&str]) -> Running {
-    let script = hiding(&[&bench.scene(), &bench.path("store")]);
+    worker_in(&hiding(&[&bench.scene(), &bench.path("store")]), bench, cluster, more)
+}
+
+/// The same by a shell script, which has the program in `"$0" "$@"`.
+fn worker_in(script: &str, bench: &Bench, cluster: &Cluster, more: &[&str]) -> Running {
     let script = format!("export PLANESWEEP_LOG=warn,planesweep_worker=debug; {script}");
     let cache = bench.path("cache");
     let given = ["worker", "--coordinator", cluster.url(), "--threads", "1", "--cache", &cache];
@@ -75,12 +79,20 @@ fn an_address_and_a_token_are_enough_and_no_photograph_comes_twice() {
     assert!(send("TERM", worker.pid()));
     let _ = worker.wait().expect_code(TERMINATED);
 
-    let worker = blind_worker(&bench, &cluster, &shown);
+    // One that may not write to the store does not see it either.
+    let store = bench.path("store");
+    let unwritable = mounted(&[
+        format!("mount -t tmpfs tmpfs {}", bench.scene()),
+        format!("mount --bind {store} {store}"),
+        format!("mount -o remount,bind,ro {store}"),
+    ]);
+    let worker = worker_in(&unwritable, &bench, &cluster, &shown);
     let again = [&shown[..], &["--depths", "40"]].concat();
     let second = bench.submit_in_script(&script, "second", cluster.url(), &again).wait().expect_code(0);
     assert!(second.stderr.contains("0 of 4 photographs and masks uploaded"), "{}", second.stderr);
     assert!(!second.stderr.contains("jobs are done already"), "{}", second.stderr);
     assert_eq!((images_fetched(&second), kept(&bench)), (0, 4), "{}", worker.stderr());
+    assert!(worker.stderr().contains(THROUGH), "{}", worker.stderr());
 }
 
 #[test]
