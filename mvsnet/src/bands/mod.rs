@@ -16,5 +16,5 @@ pub(crate) use images::{features, refined};
 pub(crate) use layers::{FeatureLayers, RegularizationLayers, refinement_layers};
 pub use predict::{InferCost, InferSize, Operations};
 pub(crate) use predict::{STEP_ROWS, cache_bytes, predict, step_rows};
-pub(crate) use stages::{PlainStage, Row, taps};
+pub(crate) use stages::{Row, taps};
 pub(crate) use volume::{Regularization, VolumeTimes};

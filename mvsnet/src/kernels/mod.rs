@@ -24,3 +24,4 @@ mod tests;
 pub(crate) mod transposed;
 pub(crate) mod winograd;
 pub(crate) mod winograd_gradient;
+pub(crate) mod winograd_volume;

@@ -17,6 +17,7 @@ use super::transposed::TransposedLayer;
 
 use super::winograd::{Target, WinogradLayer};
 use super::winograd_gradient::{ProductScratch, WinogradProducts, taps};
+use super::winograd_volume::{VolumeScratch, pair_of_rows};
 use crate::CostMetric;
 use crate::weights::uniform;
 
@@ -102,7 +103,7 @@ proptest! {
         columns in 3_usize..5, relu: bool, seed: u64,
     ) {
         let shape = Shape { columns, channels: inputs, length };
-        let input: Vec<Slab> = (0..rows).map(|i| random_slab(shape, seed ^ i as u64)).collect();
+        let input: Vec<_> = (0..rows).map(|i| Arc::new(random_slab(shape, seed ^ i as u64))).collect();
         let weights = random(outputs * inputs * 27, seed ^ 0x77);
         let bias = random(outputs, seed ^ 0x78);
         let kernel = |o, c, tap, x, k| weights[(((o * inputs + c) * 3 + tap) * 3 + x) * 3 + k];
@@ -122,18 +123,38 @@ proptest! {
             }
             output
         };
-        check(run, |x, o, i| {
+        // The first input row meets this row of the kernel.
+        let twin = |first: usize, x: usize, o: usize, i: isize| {
             if o >= outputs {
                 return (0.0, 0.0);
             }
             let terms = (0..inputs).flat_map(|c| (0..rows * 9).map(move |t| (c, t / 9, t / 3 % 3, t % 3)));
             let (value, magnitude) = sum(terms.map(|(c, tap, column, k)| {
                 let (column_at, i) = ((x + column) as isize - 1, i + k as isize - 1);
-                kernel(o, c, tap, column, k) * at(&input[tap], column_at, c, i)
+                kernel(o, c, first + tap, column, k) * at(&input[tap], column_at, c, i)
             }));
             let value = value + bias[o];
             (if relu { value.max(0.0) } else { value }, magnitude + 1.0)
-        });
+        };
+        check(run, |x, o, i| twin(0, x, o, i));
+        // In a volume, rows before or after these may be missing.
+        for first in 0..2 {
+            if rows + first == 1 || rows + first == 4 {
+                continue;
+            }
+            let whole = |level| {
+                let layer = WinogradLayer::new(level, [inputs, outputs, 3], kernel, &bias, relu);
+                let mut output = Slab::zeroed(Shape { channels: layer.outputs, ..shape });
+                let mut scratch = VolumeScratch::new(&layer, shape);
+                let pairs = 2 * output.shape().column();
+                let row = 1 - first..2 - first;
+                for (pair, columns) in output.columns_mut().chunks_mut(pairs).enumerate() {
+                    pair_of_rows(&layer, &input, row.clone(), pair, &mut [columns], &mut scratch);
+                }
+                output
+            };
+            check(whole, |x, o, i| twin(first, x, o, i));
+        }
     }
 
     #[test]
@@ -222,10 +243,10 @@ proptest! {
             let (half, end) = (products.vectors() / 2, products.vectors());
             let parts = [0..half, half..end].map(|vectors| products.sums(level, vectors, &mut scratch));
             for row in 0..rows {
-                let taps = taps(|product| {
+                let taps = taps(&std::array::from_fn(|product| {
                     let at = (((product * rows + row) * inputs + c / LANES * LANES) * outputs) / LANES + o;
                     parts.iter().map(|sums| f64::from(sums[at * LANES + c % LANES])).sum()
-                });
+                }));
                 for (column, k) in (0..9).map(|tap| (tap / 3, tap % 3)) {
                     let places = (0..slabs).flat_map(|y| (0..columns).map(move |x| (y, x)));
                     let places = places.flat_map(|(y, x)| (0..length as isize).map(move |i| (y, x, i)));

@@ -12,7 +12,7 @@ use super::simd::{LANES, Level, Simd, by_level};
 use super::slab::{COLUMN_START, Column, Shape};
 
 /// Products for a 2x2 block of outputs.
-pub(super) const PRODUCTS: usize = 16;
+pub(crate) const PRODUCTS: usize = 16;
 /// Vectors of pairs computed at a time, at most.
 const MAX_BLOCK: usize = 3;
 
@@ -21,11 +21,11 @@ const MAX_BLOCK: usize = 3;
 pub(crate) struct WinogradLayer {
     pub(crate) inputs: usize,
     pub(crate) outputs: usize,
-    relu: bool,
-    level: Level,
+    pub(super) relu: bool,
+    pub(super) level: Level,
     /// `[tap][output / block][product][input][output % block]`.
-    weights: Vec<Aligned>,
-    bias: Vec<f32>,
+    pub(super) weights: Vec<Aligned>,
+    pub(super) bias: Vec<f32>,
 }
 
 /// Two adjacent output columns that an input row is added to, or the last one alone.
@@ -74,6 +74,11 @@ impl WinogradLayer {
         Self { inputs, outputs: padded, relu, level, weights, bias }
     }
 
+    /// Rows of the kernel.
+    pub(super) fn rows(&self) -> usize {
+        self.weights.len()
+    }
+
     pub(crate) fn scratch(&self) -> WinogradScratch {
         WinogradScratch(Aligned::zeroed(PRODUCTS * (self.inputs + 8) * MAX_BLOCK * LANES))
     }
@@ -107,9 +112,18 @@ impl WinogradLayer {
 /// `G g G^T` of one 3x3 kernel.
 fn transformed(kernel: impl Fn(usize, usize) -> f64) -> [f64; PRODUCTS] {
     let along = |g: [f64; 3]| [g[0], 0.5 * (g[0] + g[1] + g[2]), 0.5 * (g[0] - g[1] + g[2]), g[2]];
-    let rows: [[f64; 4]; 3] = std::array::from_fn(|column| along([0, 1, 2].map(|k| kernel(column, k))));
-    let columns: [[f64; 4]; 4] = std::array::from_fn(|k| along([0, 1, 2].map(|column| rows[column][k])));
-    std::array::from_fn(|product| columns[product % 4][product / 4])
+    let mut rows = [[0.0; 4]; 3];
+    for column in 0..3 {
+        rows[column] = along([kernel(column, 0), kernel(column, 1), kernel(column, 2)]);
+    }
+    let mut products = [0.0; PRODUCTS];
+    for k in 0..4 {
+        let columns = along([rows[0][k], rows[1][k], rows[2][k]]);
+        for column in 0..4 {
+            products[4 * column + k] = columns[column];
+        }
+    }
+    products
 }
 
 struct Task<'a, 'b> {
@@ -230,7 +244,24 @@ unsafe fn multiply<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(
     inputs: usize,
     to: *mut f32,
 ) {
-    let mut sums = [[S::splat(0.0); VECTORS]; OUTPUTS];
+    let all = sums::<S, OUTPUTS, VECTORS>(*from, *weights, inputs, [[S::splat(0.0); VECTORS]; OUTPUTS]);
+    *from = from.add(inputs * VECTORS * LANES);
+    *weights = weights.add(inputs * OUTPUTS);
+    for o in 0..OUTPUTS {
+        for v in 0..VECTORS {
+            S::store(to.add((o * VECTORS + v) * LANES), all[o][v]);
+        }
+    }
+}
+
+/// Adds one product of all inputs.
+#[inline(always)]
+pub(super) unsafe fn sums<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(
+    mut from: *const f32,
+    mut weights: *const f32,
+    inputs: usize,
+    mut sums: [[S::V; VECTORS]; OUTPUTS],
+) -> [[S::V; VECTORS]; OUTPUTS] {
     for _ in 0..inputs {
         let mut x = [S::splat(0.0); VECTORS];
         for v in 0..VECTORS {
@@ -242,19 +273,15 @@ unsafe fn multiply<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(
                 sums[o][v] = S::mul_add(weight, x[v], sums[o][v]);
             }
         }
-        *from = from.add(VECTORS * LANES);
-        *weights = weights.add(OUTPUTS);
+        from = from.add(VECTORS * LANES);
+        weights = weights.add(OUTPUTS);
     }
-    for o in 0..OUTPUTS {
-        for v in 0..VECTORS {
-            S::store(to.add((o * VECTORS + v) * LANES), sums[o][v]);
-        }
-    }
+    sums
 }
 
 /// `A^T m A` of 16 blocks: 32 values of each of two columns.
 #[inline(always)]
-unsafe fn inverse<S: Simd>(from: *const f32, step: usize) -> [(S::V, S::V); 2] {
+pub(super) unsafe fn inverse<S: Simd>(from: *const f32, step: usize) -> [(S::V, S::V); 2] {
     let mut left = [S::splat(0.0); 4];
     let mut right = [S::splat(0.0); 4];
     for k in 0..4 {

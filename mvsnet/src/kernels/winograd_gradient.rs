@@ -71,11 +71,20 @@ impl WinogradProducts<'_> {
 }
 
 /// The gradient of a kernel's 3x3 taps `[column][k]`, from the sums of its products.
-pub(crate) fn taps(product: impl Fn(usize) -> f64) -> [[f64; 3]; 3] {
+pub(crate) fn taps(products: &[f64; PRODUCTS]) -> [[f64; 3]; 3] {
     let along = |m: [f64; 4]| [m[0] + 0.5 * (m[1] + m[2]), 0.5 * (m[1] - m[2]), 0.5 * (m[1] + m[2]) + m[3]];
-    let columns = [0, 4, 8, 12].map(|column| along([0, 1, 2, 3].map(|k| product(column + k))));
-    let rows: [[f64; 3]; 3] = std::array::from_fn(|k| along(columns.map(|column| column[k])));
-    std::array::from_fn(|column| rows.map(|row| row[column]))
+    let mut columns = [[0.0; 3]; 4];
+    for (column, m) in columns.iter_mut().zip(products.as_chunks::<4>().0) {
+        *column = along(*m);
+    }
+    let mut taps = [[0.0; 3]; 3];
+    for k in 0..3 {
+        let column = along([columns[0][k], columns[1][k], columns[2][k], columns[3][k]]);
+        for at in 0..3 {
+            taps[at][k] = column[at];
+        }
+    }
+    taps
 }
 
 struct Task<'a> {

@@ -1,17 +1,22 @@
 //! Convolutions forward, and what the gradient of their output says of input and kernel.
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use rayon::prelude::*;
 
 use super::stack::{Stack, Tools};
 use crate::WeightTensor;
-use crate::bands::{PlainStage, Row, taps};
+use crate::bands::{Row, taps};
 use crate::kernels::regress::RegressionLayer;
-use crate::kernels::slab::Shape;
+use crate::kernels::slab::{Shape, Slab};
 use crate::kernels::strided::StridedLayer;
 use crate::kernels::transposed::TransposedLayer;
 use crate::kernels::winograd::{Target, WinogradLayer};
+use crate::kernels::winograd_volume::{VolumeScratch, pair_of_rows};
+
+/// Pairs of columns that are too few to keep threads busy.
+const FEW_PAIRS: usize = 16;
 
 /// What a layer does with sizes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -112,17 +117,18 @@ impl<'a> Convolution<'a> {
     pub(super) fn forward_by_bands(
         &self,
         tools: &Tools,
-        (shape, height): (Shape, usize),
+        height: usize,
         band: usize,
         rows: impl Fn(Range<usize>) -> Vec<Row>,
     ) -> (Stack, Stack) {
         let layer = self.plain(tools);
-        let mut stage = PlainStage::new(&tools.pool, &layer, shape, height);
         let (mut input, mut output) = (Vec::with_capacity(height), Vec::with_capacity(height));
         for begin in (0..height).step_by(band) {
-            let rows = rows(begin..(begin + band).min(height));
-            output.extend(stage.push(&layer, &rows));
-            input.extend(rows);
+            let end = (begin + band).min(height);
+            input.extend(rows(begin..end));
+            // The last row needs the next one.
+            let complete = if end == height { end } else { end - 1 };
+            output.extend(volume_rows(tools, &layer, &input, output.len()..complete));
         }
         (Stack::new(input), Stack::new(output))
     }
@@ -138,9 +144,9 @@ impl<'a> Convolution<'a> {
         mut take: impl FnMut(&[Row]),
     ) {
         let layer = self.mirrored(tools, gradient.shape);
-        let mut stage = PlainStage::new(&tools.pool, &layer, gradient.shape, gradient.slabs.len());
-        for rows in gradient.slabs.chunks(band) {
-            take(&stage.push(&layer, rows));
+        let height = gradient.slabs.len();
+        for begin in (0..height).step_by(band) {
+            take(&volume_rows(tools, &layer, &gradient.slabs, begin..(begin + band).min(height)));
         }
     }
 
@@ -245,8 +251,7 @@ fn add(to: &mut Stack, more: &Stack) {
 
 fn same(tools: &Tools, layer: &WinogradLayer, input: &Stack, volume: bool) -> Stack {
     if volume {
-        let mut stage = PlainStage::new(&tools.pool, layer, input.shape, input.slabs.len());
-        return Stack::new(stage.push(layer, &input.slabs));
+        return Stack::new(volume_rows(tools, layer, &input.slabs, 0..input.slabs.len()));
     }
     let shape = Shape { channels: layer.outputs, ..input.shape };
     Stack::compute(tools, input.slabs.len(), shape, |i, slab| {
@@ -262,6 +267,32 @@ fn same(tools: &Tools, layer: &WinogradLayer, input: &Stack, volume: bool) -> St
             },
         );
     })
+}
+
+/// Some output rows of a layer of a volume that keeps sizes.
+fn volume_rows(tools: &Tools, layer: &WinogradLayer, input: &[Row], rows: Range<usize>) -> Vec<Row> {
+    let from = input[0].shape();
+    let shape = Shape { channels: layer.outputs, ..from };
+    let mut slabs: Vec<Slab> = rows.clone().map(|_| tools.pool.take(shape)).collect();
+    let pairs = shape.columns.div_ceil(2);
+    // Tasks are many, and their rows as many as that allows: the first one costs as much again.
+    let height = if pairs >= FEW_PAIRS { rows.len() } else { rows.len().div_ceil(2) };
+    let mut tasks = Vec::new();
+    for (band, slabs) in slabs.chunks_mut(height.max(1)).enumerate() {
+        let begin = rows.start + band * height;
+        let band = begin..begin + slabs.len();
+        let mut outputs: Vec<Vec<&mut [f32]>> = (0..pairs).map(|_| Vec::with_capacity(slabs.len())).collect();
+        for slab in slabs {
+            let columns = slab.columns_mut().chunks_mut(2 * shape.column());
+            outputs.iter_mut().zip(columns).for_each(|(pair, columns)| pair.push(columns));
+        }
+        tasks.extend(outputs.into_iter().enumerate().map(|(pair, output)| (band.clone(), pair, output)));
+    }
+    tasks.into_par_iter().for_each_init(
+        || VolumeScratch::new(layer, from),
+        |scratch, (rows, pair, mut output)| pair_of_rows(layer, input, rows, pair, &mut output, scratch),
+    );
+    slabs.into_iter().map(Arc::new).collect()
 }
 
 fn halved(tools: &Tools, layer: &StridedLayer, input: &Stack, to: Shape, volume: bool) -> Stack {

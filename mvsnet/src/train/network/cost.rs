@@ -34,14 +34,10 @@ pub(super) fn input<'a>(
     }
 }
 
-/// The shape of the rows of the cost volume.
-pub(super) fn shape(input: &CostInput<'_>) -> Shape {
-    Shape { columns: input.reference.width(), channels: CHANNELS, length: input.inverse_depths.len() }
-}
-
 /// Some rows of the cost volume.
 pub(super) fn rows(tools: &Tools, input: &CostInput<'_>, rows: Range<usize>) -> Vec<Row> {
-    let shape = shape(input);
+    let (columns, length) = (input.reference.width(), input.inverse_depths.len());
+    let shape = Shape { columns, channels: CHANNELS, length };
     let band = Stack::compute(tools, rows.len(), shape, |row, slab| {
         let mut scratch = CostScratch::default();
         for (x, column) in slab.columns_mut().chunks_exact_mut(shape.column()).enumerate() {

@@ -8,6 +8,7 @@ use crate::WeightTensor;
 use crate::kernels::correlate::{Correlation, OUTPUTS};
 use crate::kernels::simd::LANES;
 use crate::kernels::slab::Column;
+use crate::kernels::winograd::PRODUCTS;
 use crate::kernels::winograd_gradient::{self, ProductScratch, WinogradProducts};
 
 /// Parts that a slab is cut into, at most.
@@ -84,7 +85,7 @@ impl Convolution<'_> {
         let rows = self.rows();
         let products = WinogradProducts { input: &input.slabs, gradient: &gradient.slabs, rows };
         let vectors = products.vectors();
-        let strips = vectors.div_ceil(8).min(MOST_STRIPS);
+        let strips = vectors.div_ceil(4).next_multiple_of(2).min(MOST_STRIPS).min(vectors);
         let sums = |scratch: &mut ProductScratch, strip: usize| {
             let vectors = strip * vectors / strips..(strip + 1) * vectors / strips;
             products.sums(tools.level, vectors, scratch)
@@ -92,18 +93,21 @@ impl Convolution<'_> {
         let parts = (0..strips).into_par_iter().map_init(ProductScratch::default, sums);
         let parts: Vec<Vec<f32>> = parts.collect();
         let mut values = vec![0.0; self.kernel.values.len()];
-        for (output, input) in (0..self.outputs).flat_map(|o| (0..self.inputs).map(move |i| (o, i))) {
-            for row in 0..rows {
-                let taps = winograd_gradient::taps(|product| {
+        let of_output = values.par_chunks_exact_mut(self.index(1, 0, 0, 0, 0));
+        of_output.enumerate().for_each(|(output, values)| {
+            for (input, row) in (0..self.inputs).flat_map(|input| (0..rows).map(move |row| (input, row))) {
+                let mut sums = [0.0; PRODUCTS];
+                for (product, sum) in sums.iter_mut().enumerate() {
                     let at = (product * rows + row) * self.inputs / LANES + input / LANES;
                     let at = (at * self.outputs + output) * LANES + input % LANES;
-                    parts.iter().map(|sums| f64::from(sums[at])).sum()
-                });
+                    *sum = parts.iter().map(|sums| f64::from(sums[at])).sum();
+                }
+                let taps = winograd_gradient::taps(&sums);
                 for (column, k) in (0..3).flat_map(|column| (0..3).map(move |k| (column, k))) {
-                    values[self.index(output, input, row, column, k)] = taps[column][k] as f32;
+                    values[self.index(0, input, row, column, k)] = taps[column][k] as f32;
                 }
             }
-        }
+        });
         WeightTensor { shape: self.kernel.shape.clone(), values }
     }
 

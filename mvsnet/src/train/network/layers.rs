@@ -58,12 +58,12 @@ impl<'a> Step<'a> {
         &mut self,
         convolution: &str,
         batch_norm: &str,
-        volume: (Shape, usize),
+        height: usize,
         band: usize,
         rows: impl Fn(Range<usize>) -> Vec<Row>,
     ) -> (Normalized, Stack) {
         let kernel = Convolution::new(Sizes::Same, &self.weights[&format!("{convolution}.weight")], None);
-        let (input, z) = kernel.forward_by_bands(&self.tools, volume, band, rows);
+        let (input, z) = kernel.forward_by_bands(&self.tools, height, band, rows);
         self.normalized_from(convolution, batch_norm, Sizes::Same, (input, z), None)
     }
 

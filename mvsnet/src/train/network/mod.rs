@@ -172,9 +172,9 @@ fn regularized(step: &mut Step<'_>, cost: &CostInput<'_>) -> (Regularization, Re
     let tools = step.tools.clone();
     let name = "cost_regularization.conv0";
     let (convolution, batch_norm) = (format!("{name}.conv"), format!("{name}.bn"));
-    let volume = (cost::shape(cost), cost.reference.height());
+    let height = cost.reference.height();
     let rows = |rows| cost::rows(&tools, cost, rows);
-    let (first, mut x) = step.normalized_by_bands(&convolution, &batch_norm, volume, cost::BAND, rows);
+    let (first, mut x) = step.normalized_by_bands(&convolution, &batch_norm, height, cost::BAND, rows);
     let mut down = Vec::new();
     let mut skips = Vec::new();
     for i in 1..7 {
