@@ -3,6 +3,7 @@
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
+use planesweep_proto::ServerTls;
 use planesweep_store::Objects;
 use thiserror::Error;
 use tonic::metadata::{Ascii, MetadataValue};
@@ -39,6 +40,8 @@ pub struct Config {
     pub served: Option<ServedStore>,
     /// What callers must show; needed when listening to other hosts.
     pub token: Option<String>,
+    /// With it, nobody is let in who does not speak TLS.
+    pub tls: Option<ServerTls>,
 }
 
 /// Why a configuration is refused.
@@ -73,6 +76,7 @@ impl Config {
             store_url: store_url.into(),
             served: None,
             token: None,
+            tls: None,
         }
     }
 

@@ -8,7 +8,8 @@ use std::time::Duration;
 use planesweep_plan::{Job, JobId, RunId};
 use planesweep_proto::wire::coordinator_server::CoordinatorServer;
 use planesweep_proto::{
-    CheckToken, JobResult, Order, RunStatus, ServiceError, StorePlace, SubmitHeader, Submitted, check_jobs,
+    CheckToken, JobResult, Order, Refusals, RunStatus, ServerTls, ServiceError, StorePlace, SubmitHeader,
+    Submitted, TlsError, check_jobs, serve,
 };
 use thiserror::Error;
 use tokio::net::TcpListener;
@@ -16,7 +17,6 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::Server;
-use tonic::transport::server::TcpIncoming;
 
 use crate::config::{Config, ConfigError};
 use crate::driver::{Driver, DriverHandle, Message, Settings};
@@ -37,6 +37,9 @@ pub enum StartError {
     /// The ledger is.
     #[error(transparent)]
     Ledger(#[from] LedgerError),
+    /// The certificate cannot be served with.
+    #[error("cannot speak TLS")]
+    Tls(#[from] TlsError),
     /// The address is taken, or not of this host.
     #[error("could not listen on {listen}")]
     Listen {
@@ -56,7 +59,9 @@ impl Coordinator {
     /// Opens the ledger, goes on with what it holds, and serves. The address is bound when this
     /// returns.
     pub async fn start(config: Config) -> Result<Handle, StartError> {
-        let token = config.check()?;
+        let expected = config.check()?;
+        let tls = config.tls.as_ref().map(ServerTls::acceptor).transpose()?;
+        let scheme = if tls.is_some() { "https" } else { "http" };
         let listener = TcpListener::bind(config.listen).await;
         let listener = listener.map_err(|source| StartError::Listen { listen: config.listen, source })?;
         let local_addr =
@@ -68,26 +73,26 @@ impl Coordinator {
         let settings =
             Settings { lease: config.lease, report_interval: config.report_interval(), store: store.clone() };
         let (driver, driver_task) = Driver::start(ledger.clone(), settings, closed.clone()).await?;
-        let service = Service { driver, ledger, store };
-        let server = InterceptedService::new(service.clone().into_server(), CheckToken(token.clone()));
+        let refusals = Refusals::default();
+        let service = Service { driver, ledger, store, refusals: refusals.clone() };
+        let check = CheckToken { expected, refusals: refusals.clone() };
+        let guarded = InterceptedService::new(service.clone().into_server(), check.clone());
         let blobs = config.served.as_ref().map(|served| BlobService::server(served.store.clone()));
-        let blobs = blobs.map(|blobs| InterceptedService::new(blobs, CheckToken(token)));
+        let blobs = blobs.map(|blobs| InterceptedService::new(blobs, check));
         let (health, health_service) = tonic_health::server::health_reporter();
         health.set_serving::<CoordinatorServer<Service>>().await;
         let stop = CancellationToken::new();
         let stopped = stop.clone().cancelled_owned();
-        let server_task = tokio::spawn(
-            Server::builder()
-                .tcp_nodelay(true)
-                .http2_keepalive_interval(Some(KEEP_ALIVE.0))
-                .http2_keepalive_timeout(Some(KEEP_ALIVE.1))
-                .add_service(health_service)
-                .add_service(server)
-                .add_optional_service(blobs)
-                .serve_with_incoming_shutdown(TcpIncoming::from(listener).with_nodelay(Some(true)), stopped),
-        );
+        let router = Server::builder()
+            .http2_keepalive_interval(Some(KEEP_ALIVE.0))
+            .http2_keepalive_timeout(Some(KEEP_ALIVE.1))
+            .add_service(health_service)
+            .add_service(guarded)
+            .add_optional_service(blobs);
+        let server_task = serve(router, listener, tls, refusals, stopped);
         Ok(Handle {
             local_addr,
+            scheme,
             report_interval: config.report_interval(),
             service,
             stop: stop.drop_guard(),
@@ -101,6 +106,7 @@ impl Coordinator {
 /// A running coordinator. Dropped without [`Handle::shutdown`], it stops as if it were killed.
 pub struct Handle {
     local_addr: SocketAddr,
+    scheme: &'static str,
     report_interval: Duration,
     service: Service,
     stop: DropGuard,
@@ -117,7 +123,7 @@ impl Handle {
 
     /// The address for [`planesweep_proto::Client::connect`].
     pub fn url(&self) -> String {
-        format!("http://{}", self.local_addr)
+        format!("{}://{}", self.scheme, self.local_addr)
     }
 
     /// Submits a plan, as over the wire and with the same checks of each job; each job follows those

@@ -14,8 +14,8 @@ use crate::failover::Failover;
 use crate::limits::{MAX_MESSAGE_BYTES, SUBMIT_CHUNK_BYTES};
 use crate::wire::coordinator_client::CoordinatorClient;
 use crate::{
-    BlobClient, CODE_VERSION, Code, JobResult, PROTOCOL_VERSION, Report, ReportReply, RunStatus, RunSummary,
-    ServiceError, StorePlace, SubmitHeader, Submitted, check_jobs, wire,
+    BlobClient, CODE_VERSION, Code, Credentials, JobResult, PROTOCOL_VERSION, Report, ReportReply, RunStatus,
+    RunSummary, ServiceError, StorePlace, SubmitHeader, Submitted, check_jobs, wire,
 };
 
 /// The metadata key that carries the token.
@@ -72,8 +72,22 @@ impl Client {
     ///
     /// Must be called within a tokio runtime.
     pub fn connect(url: &str, token: Option<&str>) -> Result<Self, ServiceError> {
-        let token = WithToken(token.map(bearer).transpose()?);
-        let endpoints = url.split(',').map(str::trim).map(endpoint).collect::<Result<Vec<_>, _>>()?;
+        Self::connect_with(url, &Credentials::of_token(token))
+    }
+
+    /// The same with a token or certificates that vouch for `https://` coordinators.
+    pub fn connect_with(url: &str, credentials: &Credentials) -> Result<Self, ServiceError> {
+        let token = WithToken(credentials.token.as_deref().map(bearer).transpose()?);
+        let endpoint = |url: &str| -> Result<Endpoint, ServiceError> {
+            Ok(credentials
+                .endpoint(url.trim())?
+                .connect_timeout(CONNECT_TIMEOUT)
+                .tcp_nodelay(true)
+                .http2_keep_alive_interval(KEEP_ALIVE.0)
+                .keep_alive_timeout(KEEP_ALIVE.1)
+                .keep_alive_while_idle(true))
+        };
+        let endpoints = url.split(',').map(endpoint).collect::<Result<Vec<_>, _>>()?;
         let blobs = BlobClient::new(&endpoints, &token);
         let stub = |endpoint: &Endpoint| {
             CoordinatorClient::with_interceptor(endpoint.connect_lazy(), token.clone())
@@ -179,17 +193,6 @@ impl Client {
         self.coordinators.call_any(cancel).await?;
         Ok(())
     }
-}
-
-fn endpoint(url: &str) -> Result<Endpoint, ServiceError> {
-    let endpoint = Endpoint::from_shared(url.to_owned())
-        .map_err(|e| ServiceError::new(Code::Invalid, format!("\"{url}\" is no address: {e}")))?;
-    Ok(endpoint
-        .connect_timeout(CONNECT_TIMEOUT)
-        .tcp_nodelay(true)
-        .http2_keep_alive_interval(KEEP_ALIVE.0)
-        .keep_alive_timeout(KEEP_ALIVE.1)
-        .keep_alive_while_idle(true))
 }
 
 /// Jobs in chunks of about [`SUBMIT_CHUNK_BYTES`], encoded one chunk at a time.

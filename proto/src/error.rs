@@ -6,6 +6,7 @@ use thiserror::Error;
 use tonic::Status;
 
 use crate::WireError;
+use crate::credentials::certificate_trouble;
 
 /// What kind of refusal it is. Each has one gRPC code, so it survives the wire.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -79,13 +80,7 @@ impl From<WireError> for ServiceError {
         } else {
             Code::Invalid
         };
-        let mut message = error.to_string();
-        let mut cause = std::error::Error::source(&error);
-        while let Some(inner) = cause {
-            message = format!("{message}: {inner}");
-            cause = inner.source();
-        }
-        Self::new(code, message)
+        Self::new(code, with_causes(error.to_string(), std::error::Error::source(&error)))
     }
 }
 
@@ -123,8 +118,25 @@ impl From<Status> for ServiceError {
             | tonic::Code::Unknown => Code::Unavailable,
             _ => Code::Internal,
         };
-        Self::new(code, status.message())
+        if let Some(advice) = certificate_trouble(&status) {
+            return Self::new(Code::Unauthenticated, advice);
+        }
+        // "transport error" alone helps nobody.
+        let message = with_causes(status.message().to_owned(), std::error::Error::source(&status));
+        Self::new(code, message)
     }
+}
+
+/// What an error says, with what caused it, outermost first, and nothing twice.
+pub(crate) fn with_causes(mut text: String, mut cause: Option<&(dyn std::error::Error + 'static)>) -> String {
+    while let Some(inner) = cause {
+        let said = inner.to_string();
+        if !text.contains(&said) {
+            text = format!("{text}: {said}");
+        }
+        cause = inner.source();
+    }
+    text
 }
 
 #[cfg(test)]

@@ -22,18 +22,21 @@
 mod blobs;
 mod client;
 mod convert;
+mod credentials;
 mod error;
 mod failover;
 pub mod limits;
 mod peer;
 mod report;
 mod run;
+mod tls;
 mod token;
 mod way;
 
 pub use blobs::BlobClient;
 pub use client::{Client, TOKEN_HEADER, bearer};
 pub use convert::{WireError, check_job, check_jobs, decode_job, encode_job};
+pub use credentials::Credentials;
 pub use error::{Code, ServiceError};
 pub use peer::PeerClient;
 pub use report::{
@@ -41,7 +44,8 @@ pub use report::{
     Report, ReportReply, Role, Slots, StorePlace, Success, WorkerState,
 };
 pub use run::{JobResult, JobState, RunStatus, RunSummary, SubmitHeader, Submitted, WorkerStatus};
-pub use token::CheckToken;
+pub use tls::{ServerTls, TlsError, serve};
+pub use token::{CheckToken, Refusals};
 pub use way::{IMAGES_FETCHED, Way, images_fetched, maps_by_way};
 
 /// Raised when a message changes its meaning; two sides with different numbers refuse each other.

@@ -6,12 +6,12 @@ use bytes::{Bytes, BytesMut};
 use planesweep_plan::BlobKey;
 use tokio_stream::StreamExt;
 use tonic::service::interceptor::InterceptedService;
-use tonic::transport::{Channel, Endpoint};
+use tonic::transport::Channel;
 
 use crate::client::{KEEP_ALIVE, WithToken};
 use crate::limits::MAX_EXCHANGE_MESSAGE_BYTES;
 use crate::wire::exchange_client::ExchangeClient;
-use crate::{Code, ServiceError, bearer, wire};
+use crate::{Code, Credentials, ServiceError, bearer, wire};
 
 /// How long a connection may take: a worker that is slow to reach is not the shorter way.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
@@ -33,10 +33,12 @@ impl PeerClient {
     /// first call and again by the next call after it broke.
     ///
     /// Must be called within a tokio runtime.
-    pub fn connect(url: &str, token: Option<&str>) -> Result<Self, ServiceError> {
-        let token = token.map(bearer).transpose()?;
-        let endpoint = Endpoint::from_shared(url.to_owned())
-            .map_err(|e| ServiceError::new(Code::Invalid, format!("\"{url}\" is no address: {e}")))?
+    pub fn connect(url: &str, credentials: &Credentials) -> Result<Self, ServiceError> {
+        let token = credentials.token.as_deref().map(bearer).transpose()?;
+        // Certificates vouch only for those that have one; a worker of this host needs none.
+        let is_tls = url.starts_with("https://");
+        let endpoint = Credentials { ca_pem: credentials.ca_pem.clone().filter(|_| is_tls), token: None }
+            .endpoint(url)?
             .connect_timeout(CONNECT_TIMEOUT)
             .tcp_nodelay(true)
             .initial_stream_window_size(WINDOW_BYTES)

@@ -49,6 +49,13 @@ impl Bench {
         fs::read(self.path(name)).unwrap_or_else(|error| panic!("cannot read {name}: {error}"))
     }
 
+    /// Compares the bytes of two clouds.
+    #[track_caller]
+    pub fn same_cloud(&self, one: &str, other: &str) {
+        let read = |out: &str| self.read(&format!("{out}/cloud.ply"));
+        assert!(read(one).len() > 10_000 && read(one) == read(other), "{one} and {other} differ");
+    }
+
     /// Starts `planesweep reconstruct --json` into `out`, with `more` options in place of the easy ones
     /// of the same name, or after them.
     pub fn start(&self, out: &str, more: &[&str]) -> Running {

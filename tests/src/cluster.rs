@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use serde_json::Value;
+
 use crate::bench::Bench;
 use crate::faults::{send, wait_until};
 use crate::program::Running;
@@ -56,6 +58,11 @@ impl Cluster {
         &mut self.coordinator
     }
 
+    /// What the coordinator has said so far.
+    pub fn coordinator_stderr(&self) -> String {
+        self.coordinator.stderr()
+    }
+
     /// Kills the coordinator and, when this client misses it, starts another on the same ledger and address.
     #[track_caller]
     pub fn kill_and_restart(&mut self, client: &Running) {
@@ -72,6 +79,13 @@ impl Cluster {
     pub fn worker(&self, more: &[&str]) -> Running {
         let given = ["worker", "--coordinator", &self.url, "--threads", "1"];
         Running::start_in(&self.environment, given.iter().chain(more))
+    }
+
+    /// What `planesweep status` says of a run.
+    #[track_caller]
+    pub fn status(&self, run: &str, more: &[&str]) -> Value {
+        let given = ["status", run, "--coordinator", &self.url, "--json"];
+        Running::start_in(&self.environment, given.iter().chain(more)).wait().expect_one_of(&[0, 3]).json()
     }
 
     /// Ends the coordinator as a service manager does; it takes its workers with it.

@@ -7,6 +7,7 @@
 
 mod bench;
 pub mod benchmarks;
+mod certificates;
 mod cluster;
 mod containers;
 mod convert_middlebury;
@@ -25,6 +26,7 @@ mod shared_scenes;
 mod slurm;
 
 pub use bench::Bench;
+pub use certificates::{Authority, ServerCertificate};
 pub use cluster::Cluster;
 pub use containers::Containers;
 pub use convert_middlebury::{Bounds, convert_middlebury};

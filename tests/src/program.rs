@@ -35,6 +35,15 @@ impl Finished {
         self
     }
 
+    /// The same with one of these exit codes.
+    #[must_use]
+    #[track_caller]
+    pub fn expect_one_of(self, codes: &[i32]) -> Self {
+        let is_expected = self.code.is_some_and(|code| codes.contains(&code));
+        assert!(is_expected, "ended with {:?}: {}\n{}", self.code, self.stdout, self.stderr);
+        self
+    }
+
     /// The one JSON object that stdout must be.
     #[track_caller]
     pub fn json(&self) -> Value {

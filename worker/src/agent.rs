@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 
 use planesweep_plan::{NUMERICS_VERSION, WorkerId};
 use planesweep_proto::{
-    CODE_VERSION, Client, Failure, Grant, JobAttempt, Order, Outcome, PROTOCOL_VERSION, Report, ReportReply,
-    Role, ServiceError, Slots, StorePlace, WorkerState,
+    CODE_VERSION, Client, Credentials, Failure, Grant, JobAttempt, Order, Outcome, PROTOCOL_VERSION, Report,
+    ReportReply, Role, ServiceError, Slots, StorePlace, WorkerState,
 };
 use thiserror::Error;
 use tokio::sync::mpsc;
@@ -40,8 +40,8 @@ pub struct WorkerConfig {
     /// The coordinator, such as `http://127.0.0.1:7070`; with commas between, several that share a ledger: the
     /// worker goes on to the next when one cannot be reached or goes.
     pub coordinator: String,
-    /// The token, when the coordinator wants one.
-    pub token: Option<String>,
+    /// What is shown to the coordinator and to other workers, and who vouches for them.
+    pub credentials: Credentials,
     /// One life of this process.
     pub id: WorkerId,
     /// Name of this host.
@@ -67,8 +67,8 @@ pub struct WorkerConfig {
 /// Why a worker ended before its time.
 #[derive(Debug, Error)]
 pub enum WorkerError {
-    /// The coordinator refuses this worker.
-    #[error("coordinator {url} refuses this worker")]
+    /// The coordinator refuses this worker, or the worker does not trust it.
+    #[error("cannot work for coordinator {url}")]
     Refused {
         /// The coordinator.
         url: String,
@@ -96,8 +96,9 @@ pub enum WorkerError {
 /// Works until the coordinator says stop or `stop` is cancelled; a running job is ended first, what
 /// was only queued is given back.
 pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result<(), WorkerError> {
-    let client = Client::connect(&config.coordinator, config.token.as_deref())
+    let client = Client::connect_with(&config.coordinator, &config.credentials)
         .map_err(|source| WorkerError::Refused { url: config.coordinator.clone(), source })?;
+    config.exchange.check(&config.coordinator)?;
     let device = Device::start(config.backend).map_err(WorkerError::Device)?;
     let maps = Arc::new(Maps::new(config.cache_bytes));
     let disk_cache = DiskCache::new(config.disk_cache.0, config.disk_cache.1);
@@ -106,7 +107,7 @@ pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result
         &config.id,
         &config.host,
         config.role,
-        config.token,
+        config.credentials,
         Arc::clone(&maps),
         config.cache_bytes,
     )

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use planesweep_proto::Client;
+use planesweep_proto::{Client, Credentials, ServerTls};
 
 /// Where the token comes from when no file is named.
 const TOKEN_VARIABLE: &str = "PLANESWEEP_TOKEN";
@@ -18,13 +18,6 @@ pub struct TokenArgs {
 }
 
 impl TokenArgs {
-    /// The options of another command that call the coordinator at `url` with the same token.
-    pub fn passed_on(&self, url: &str) -> Vec<String> {
-        let file = self.token_file.iter();
-        let token = file.flat_map(|path| ["--token-file".to_owned(), path.to_string_lossy().into_owned()]);
-        ["--coordinator".to_owned(), url.to_owned()].into_iter().chain(token).collect()
-    }
-
     /// The token, if there is one.
     pub fn read(&self) -> Result<Option<String>> {
         let Some(path) = &self.token_file else {
@@ -40,21 +33,70 @@ impl TokenArgs {
     }
 }
 
+/// What is shown to a coordinator, and who vouches for it.
+#[derive(Clone, Debug, Args)]
+pub struct CredentialArgs {
+    #[command(flatten)]
+    pub token: TokenArgs,
+    /// The certificates that vouch for an https:// coordinator, PEM; by default those of the system.
+    #[arg(long, env = "PLANESWEEP_TLS_CA", value_name = "FILE")]
+    pub tls_ca: Option<PathBuf>,
+}
+
+impl CredentialArgs {
+    /// The options of another command that call the coordinator at `url` with the same credentials.
+    pub fn passed_on(&self, url: &str) -> Vec<String> {
+        let files = [("--token-file", &self.token.token_file), ("--tls-ca", &self.tls_ca)];
+        let files = files.into_iter().filter_map(|(option, file)| Some((option, file.as_ref()?)));
+        let files = files.flat_map(|(option, file)| [option.to_owned(), file.to_string_lossy().into_owned()]);
+        ["--coordinator".to_owned(), url.to_owned()].into_iter().chain(files).collect()
+    }
+
+    /// What the files hold.
+    pub fn read(&self) -> Result<Credentials> {
+        let ca_pem = self.tls_ca.as_deref().map(read_pem).transpose()?;
+        Ok(Credentials { token: self.token.read()?, ca_pem })
+    }
+}
+
+/// Who a server is.
+#[derive(Clone, Debug, Args)]
+pub struct ServerTlsArgs {
+    /// The certificate of this server, with those that vouch for it, PEM; with it, only TLS is spoken.
+    #[arg(long, env = "PLANESWEEP_TLS_CERT", value_name = "FILE", requires = "tls_key")]
+    pub tls_cert: Option<PathBuf>,
+    /// The certificate's private key, PEM.
+    #[arg(long, env = "PLANESWEEP_TLS_KEY", value_name = "FILE", requires = "tls_cert")]
+    pub tls_key: Option<PathBuf>,
+}
+
+impl ServerTlsArgs {
+    /// What the files hold, if they are named.
+    pub fn read(&self) -> Result<Option<ServerTls>> {
+        let (Some(cert), Some(key)) = (&self.tls_cert, &self.tls_key) else { return Ok(None) };
+        Ok(Some(ServerTls { cert_pem: read_pem(cert)?, key_pem: read_pem(key)? }))
+    }
+}
+
+fn read_pem(path: &Path) -> Result<Vec<u8>> {
+    std::fs::read(path).with_context(|| format!("cannot read the certificate or key in {}", path.display()))
+}
+
 /// How a coordinator is reached.
 #[derive(Clone, Debug, Args)]
 pub struct ConnectArgs {
-    /// The coordinator's address, such as http://10.0.0.1:7070; with commas between, several that share a
-    /// ledger, of which the next is called when one cannot be reached.
+    /// The coordinator's address, such as http://10.0.0.1:7070 or https://head:7070; with commas between, several
+    /// that share a ledger, of which the next is called when one cannot be reached.
     #[arg(long, env = "PLANESWEEP_COORDINATOR", value_name = "URL")]
     pub coordinator: String,
     #[command(flatten)]
-    pub token: TokenArgs,
+    pub credentials: CredentialArgs,
 }
 
 impl ConnectArgs {
     /// A client of the coordinator; must be called within a tokio runtime.
     pub fn client(&self) -> Result<Client> {
-        Client::connect(&self.coordinator, self.token.read()?.as_deref())
+        Client::connect_with(&self.coordinator, &self.credentials.read()?)
             .with_context(|| format!("cannot call the coordinator at {}", self.coordinator))
     }
 }

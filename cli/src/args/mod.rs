@@ -8,7 +8,7 @@ pub mod values;
 
 use clap::{Parser, Subcommand};
 
-pub use self::cluster::{ConnectArgs, TokenArgs, store_url};
+pub use self::cluster::{ConnectArgs, CredentialArgs, ServerTlsArgs, TokenArgs, store_url};
 pub use self::fusion::FilterArgs;
 pub use self::inference::{NetworkArgs, PlanArgs};
 pub use self::scene::ReadArgs;

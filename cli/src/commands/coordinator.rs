@@ -11,7 +11,7 @@ use serde_json::json;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::args::values::seconds;
-use crate::args::{TokenArgs, store_url};
+use crate::args::{ServerTlsArgs, TokenArgs, store_url};
 use crate::console::Outcome;
 use crate::host::unique;
 
@@ -36,6 +36,8 @@ pub struct CoordinatorArgs {
     pub store: String,
     #[command(flatten)]
     pub token: TokenArgs,
+    #[command(flatten)]
+    pub tls: ServerTlsArgs,
     /// How long a worker that does not report keeps its jobs; all other times follow from it.
     #[arg(long, default_value = "7", value_name = "SECONDS", value_parser = seconds)]
     pub lease: Duration,
@@ -52,6 +54,7 @@ pub fn run(args: &CoordinatorArgs) -> Result<Outcome> {
         lease: args.lease,
         token: args.token.read()?,
         served: Some(ServedStore { store: store.clone(), identity }),
+        tls: args.tls.read()?,
         ..Config::new(&*args.ledger, store.url())
     };
     let url = runtime.block_on(serve(config))?;

@@ -137,6 +137,15 @@ fn describe(run: &RunId, status: &RunStatus) -> Outcome {
             waiting.as_secs()
         ));
     }
+    for (count, what) in [
+        (status.late_results, "results came too late and were refused"),
+        (status.divergent_results, "of them differed from the published ones"),
+        (status.refused_callers, "callers were refused (no token, a wrong one, or no TLS)"),
+    ] {
+        if count > 0 {
+            text.push_str(&format!("{count} {what}\n"));
+        }
+    }
     for failed in &status.failures {
         let (_, message) = failed.failure.clone().unwrap_or_default();
         let of = failed.view.map_or_else(|| "the cloud".to_owned(), |view| format!("view {view}"));
@@ -160,6 +169,7 @@ fn describe(run: &RunId, status: &RunStatus) -> Outcome {
         "waiting_seconds": status.waiting.map(|waiting| waiting.as_secs_f64()),
         "late_results": status.late_results,
         "divergent_results": status.divergent_results,
+        "refused_callers": status.refused_callers,
     });
     let skipped_views = status.finished && status.count(JobState::Failed) > 0;
     Outcome { text, value, skipped_views }

@@ -13,8 +13,8 @@ use planesweep_worker::{ExchangeConfig, WorkerConfig, WorkerError, run_worker};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
-use crate::args::ConnectArgs;
 use crate::args::values::bytes;
+use crate::args::{ConnectArgs, ServerTlsArgs};
 use crate::console::Outcome;
 use crate::host;
 use crate::network::{Placement, backend_factory, processors};
@@ -36,6 +36,8 @@ pub struct WorkerArgs {
     /// a free one. Beyond this host a token is needed.
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:0")]
     pub listen: SocketAddr,
+    #[command(flatten)]
+    pub tls: ServerTlsArgs,
     /// Send no maps through shared memory to the fusion worker of this host.
     #[arg(long)]
     pub no_shared_memory: bool,
@@ -108,7 +110,7 @@ pub fn run(args: WorkerArgs) -> Result<Outcome> {
     let nonce = host::unique().context("cannot make an id for this worker")?;
     let config = WorkerConfig {
         coordinator: args.connect.coordinator,
-        token: args.connect.token.read()?,
+        credentials: args.connect.credentials.read()?,
         id: WorkerId(format!("{host}-{}-{}", std::process::id(), &nonce[..8.min(nonce.len())])),
         host,
         boot_id: host::boot_id(),
@@ -122,7 +124,11 @@ pub fn run(args: WorkerArgs) -> Result<Outcome> {
         slots: SLOTS,
         cache_bytes: CACHE_BYTES,
         disk_cache: (args.cache, args.cache_size),
-        exchange: ExchangeConfig { listen: args.listen, shared_memory: !args.no_shared_memory },
+        exchange: ExchangeConfig {
+            listen: args.listen,
+            tls: args.tls.read()?,
+            shared_memory: !args.no_shared_memory,
+        },
     };
     let id = config.id.0.clone();
     let runtime = tokio::runtime::Builder::new_multi_thread()

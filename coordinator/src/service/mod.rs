@@ -10,7 +10,7 @@ use std::sync::Arc;
 use planesweep_plan::NUMERICS_VERSION;
 use planesweep_proto::limits::MAX_MESSAGE_BYTES;
 use planesweep_proto::wire::coordinator_server::{Coordinator, CoordinatorServer};
-use planesweep_proto::{CODE_VERSION, Code, PROTOCOL_VERSION, ServiceError, StorePlace, wire};
+use planesweep_proto::{CODE_VERSION, Code, PROTOCOL_VERSION, Refusals, ServiceError, StorePlace, wire};
 use tokio_stream::Stream;
 use tonic::{Request, Response, Status, Streaming};
 
@@ -25,6 +25,7 @@ pub(crate) struct Service {
     pub driver: DriverHandle,
     pub ledger: Arc<Ledger>,
     pub store: StorePlace,
+    pub refusals: Refusals,
 }
 
 impl Service {

@@ -88,6 +88,7 @@ impl Service {
             waiting: fleet.without_worker.filter(|_| !finished),
             late_results: fleet.late_results,
             divergent_results: fleet.divergent_results,
+            refused_callers: self.refusals.total(),
         })
     }
 

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use planesweep_coordinator::{Config, Coordinator, StartError};
 use planesweep_plan::{Attempt, Job, NUMERICS_VERSION, RunId, WorkerId};
+use planesweep_proto::wire::coordinator_client::CoordinatorClient;
 use planesweep_proto::{CODE_VERSION, Client, Code, JobState, PROTOCOL_VERSION, ServiceError, SubmitHeader};
 
 use toy::{DEADLINE, Place, Toy, cloud, config, finished, plan, start, submit, undisturbed};
@@ -154,11 +155,19 @@ async fn the_uninvited_are_refused() {
         let error = client.status(&run, 0).await.expect_err("there is no such run");
         assert_eq!(error.code, code, "{error}");
     }
+    // The answer does not wait for the body, which never comes.
+    let mut stub = CoordinatorClient::connect(handle.url()).await.expect("a connection");
+    let refused = tokio::time::timeout(DEADLINE, stub.submit(tokio_stream::pending())).await;
+    let error = ServiceError::from(refused.expect("answered at once").expect_err("no token"));
+    assert_eq!(error.code, Code::Unauthenticated, "{error}");
+
     let mut client = Client::connect(&handle.url(), Some("s3cret")).expect("a valid address");
     let header = SubmitHeader { name: "odd".into(), ..SubmitHeader::default() };
     let error = client.submit(&header, plan(3).split_off(1)).await.expect_err("a need is missing");
     assert_eq!(error.code, Code::Invalid);
     assert!(error.message.contains("not listed before it"), "{error}");
+    let run = client.submit(&header, plan(3)).await.expect("a good plan").run;
+    assert_eq!(client.status(&run, 0).await.expect("a status").refused_callers, 3);
     handle.shutdown().await;
 }
 
@@ -166,9 +175,7 @@ async fn the_uninvited_are_refused() {
 async fn other_versions_are_refused_by_name() {
     let place = Place::file();
     let handle = start(&place).await;
-    let mut client = planesweep_proto::wire::coordinator_client::CoordinatorClient::connect(handle.url())
-        .await
-        .expect("a connection");
+    let mut client = CoordinatorClient::connect(handle.url()).await.expect("a connection");
     let request = planesweep_proto::wire::ReportRequest {
         protocol_version: PROTOCOL_VERSION,
         code_version: "0.0.9".into(),

@@ -207,6 +207,7 @@ impl From<&RunStatus> for wire::StatusReply {
             waiting_ms: status.waiting.map(|waiting| waiting.as_millis() as u64),
             late_results: status.late_results,
             divergent_results: status.divergent_results,
+            refused_callers: status.refused_callers,
         }
     }
 }
@@ -234,6 +235,7 @@ impl TryFrom<wire::StatusReply> for RunStatus {
             waiting: status.waiting_ms.map(Duration::from_millis),
             late_results: status.late_results,
             divergent_results: status.divergent_results,
+            refused_callers: status.refused_callers,
         })
     }
 }
@@ -297,6 +299,7 @@ mod tests {
             waiting: Some(Duration::from_millis(9)),
             late_results: 4,
             divergent_results: 1,
+            refused_callers: 7,
         };
         assert_eq!(RunStatus::try_from(wire::StatusReply::from(&status)), Ok(status));
     }

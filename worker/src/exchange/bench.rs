@@ -23,7 +23,9 @@ async fn sender() {
     let Ok(inbox) = std::env::var(INBOX) else { return };
     let maps = Arc::new(Maps::new(1 << 30));
     let listen = "127.0.0.1:0".parse().expect("an address");
-    let served = serve(listen, "localhost", None, Arc::clone(&maps), None).await.expect("loopback is there");
+    let config = ExchangeConfig { listen, tls: None, shared_memory: false };
+    let served =
+        start_serving(&config, "localhost", None, Arc::clone(&maps), None).await.expect("loopback is there");
     println!("{}", served.address);
     let outbox = Outbox::open(&inbox).expect("the parent's inbox");
     let mut made = None;
@@ -97,7 +99,7 @@ async fn shared_memory_against_streams() {
     let answers = BufReader::new(child.stdout.take().expect("piped")).lines();
     let mut sender = Sender { orders: child.stdin.take().expect("piped"), answers };
     let address = Some(sender.answer(|word| word.starts_with("http://")));
-    let peers = Peers::new(None);
+    let peers = Peers::new(Credentials::default());
     peers.learn(&[Peer { worker: WorkerId("sender".into()), endpoint: Endpoint { address, inbox: None } }]);
 
     for (width, height, size) in SIZES {

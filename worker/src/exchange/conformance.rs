@@ -48,9 +48,10 @@ impl Party {
         let number = NEXT.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
         let id = WorkerId(format!("{name}-{}-{number}", std::process::id()));
         let maps = Arc::new(Maps::new(64 << 20));
-        let config = ExchangeConfig { listen: LOOPBACK, shared_memory };
-        let token = token.map(ToOwned::to_owned);
-        let exchange = Exchange::start(&config, &id, "host", role, token, Arc::clone(&maps), INBOX_BYTES);
+        let config = ExchangeConfig { listen: LOOPBACK, tls: None, shared_memory };
+        let credentials = Credentials::of_token(token);
+        let exchange =
+            Exchange::start(&config, &id, "host", role, credentials, Arc::clone(&maps), INBOX_BYTES);
         Self { exchange: exchange.await.expect("loopback is there"), id, maps }
     }
 
@@ -247,9 +248,13 @@ async fn a_loan_that_is_not_sent_is_given_back() {
 #[tokio::test]
 async fn nobody_is_served_without_the_token() {
     let served = |listen: &str, token: Option<&'static str>| {
-        let listen = listen.parse().expect("an address");
-        async move { serve(listen, "host", token, Arc::new(Maps::new(0)), None).await }
+        let config =
+            ExchangeConfig { listen: listen.parse().expect("an address"), tls: None, shared_memory: false };
+        async move { start_serving(&config, "host", token, Arc::new(Maps::new(0)), None).await }
     };
+    let open = ExchangeConfig { listen: ([0, 0, 0, 0], 0).into(), tls: None, shared_memory: false };
+    assert!(matches!(open.check("https://head:7070"), Err(ExchangeError::NoTls { .. })));
+    assert!(open.check("http://head:7070").is_ok());
     assert!(matches!(served("0.0.0.0:0", None).await, Err(ExchangeError::NoToken { .. })));
     let everywhere = served("0.0.0.0:0", Some("token")).await.expect("with a token");
     assert!(everywhere.address.starts_with("http://host:"), "{}", everywhere.address);
@@ -260,7 +265,8 @@ async fn nobody_is_served_without_the_token() {
         (Some("tokem"), Code::Unauthenticated),
         (Some("token"), Code::NotFound),
     ] {
-        let mut client = PeerClient::connect(&served.address, token).expect("an address");
+        let mut client =
+            PeerClient::connect(&served.address, &Credentials::of_token(token)).expect("an address");
         assert_eq!(client.fetch(&BlobKey([1; 32]), 9).await.map_err(|e| e.code), Err(code), "{token:?}");
         assert_eq!(client.open_inbox("x").await.map_err(|e| e.code), Err(code), "{token:?}");
     }
@@ -306,7 +312,7 @@ async fn wrong_bytes_too_many_and_too_large_messages_are_refused() {
         let server = tonic::transport::Server::builder().add_service(liar);
         let server =
             tokio::spawn(server.serve_with_incoming(tonic::transport::server::TcpIncoming::from(listener)));
-        let mut client = PeerClient::connect(&address, None).expect("an address");
+        let mut client = PeerClient::connect(&address, &Credentials::default()).expect("an address");
         let error = client.fetch(&BlobKey::of(b"map"), 3).await.expect_err("not the map");
         assert_eq!(error.code, code, "{length:?}: {error}");
         server.abort();

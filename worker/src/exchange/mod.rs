@@ -32,13 +32,13 @@ use std::time::Duration;
 
 use bytes::{BufMut, Bytes};
 use planesweep_plan::{BlobKey, WorkerId};
-use planesweep_proto::{Endpoint, Peer, Produced, Role, ServiceError, Way};
+use planesweep_proto::{Credentials, Endpoint, Peer, Produced, Role, ServerTls, ServiceError, TlsError, Way};
 use thiserror::Error;
 
 use loan::Loan;
 use outgoing::Outgoing;
 use peers::Peers;
-use server::{Served, serve};
+use server::{Served, start_serving};
 use shared_memory::{Inbox, Outbox, SharedMemoryError};
 
 use crate::jobs::compute;
@@ -55,8 +55,21 @@ pub struct ExchangeConfig {
     /// Where others fetch what this worker has in memory. Beyond the host's own addresses a token is
     /// needed.
     pub listen: SocketAddr,
+    /// With it, others fetch over TLS only.
+    pub tls: Option<ServerTls>,
     /// Whether maps go through shared memory where they can.
     pub shared_memory: bool,
+}
+
+impl ExchangeConfig {
+    /// Checks that a worker of this coordinator may serve its maps so.
+    pub(crate) fn check(&self, coordinator: &str) -> Result<(), ExchangeError> {
+        let is_guarded = self.tls.is_some() || self.listen.ip().is_loopback();
+        if coordinator.starts_with("https://") && !is_guarded {
+            return Err(ExchangeError::NoTls { listen: self.listen });
+        }
+        Ok(())
+    }
 }
 
 /// Why a worker cannot exchange maps.
@@ -68,6 +81,18 @@ pub enum ExchangeError {
         /// The address.
         listen: SocketAddr,
     },
+    /// The token, and the maps, would travel in plain text.
+    #[error(
+        "the coordinator speaks TLS, so maps are served beyond this host over TLS only: give a certificate and \
+         its key, or do not listen on {listen}"
+    )]
+    NoTls {
+        /// The address.
+        listen: SocketAddr,
+    },
+    /// The certificate cannot be served with.
+    #[error("cannot speak TLS")]
+    Tls(#[from] TlsError),
     /// The token cannot be sent.
     #[error("the token is refused")]
     Token(#[source] ServiceError),
@@ -98,14 +123,14 @@ impl Exchange {
         worker: &WorkerId,
         host: &str,
         role: Role,
-        token: Option<String>,
+        credentials: Credentials,
         maps: Arc<Maps>,
         inbox_bytes: u64,
     ) -> Result<Self, ExchangeError> {
         let has_inbox = config.shared_memory && role == Role::Fuse;
         let inbox = if has_inbox { open_inbox(worker.0.clone(), inbox_bytes).await } else { None };
-        let served = serve(config.listen, host, token.as_deref(), maps, inbox.clone()).await?;
-        let peers = Arc::new(Peers::new(token));
+        let served = start_serving(config, host, credentials.token.as_deref(), maps, inbox.clone()).await?;
+        let peers = Arc::new(Peers::new(credentials));
         let outgoing = Outgoing::new(config.shared_memory && !has_inbox, Arc::clone(&peers));
         Ok(Self { inbox, outgoing, peers, served })
     }

@@ -5,18 +5,18 @@ use std::sync::{Mutex, PoisonError};
 
 use bytes::Bytes;
 use planesweep_plan::WorkerId;
-use planesweep_proto::{Peer, PeerClient, Produced, ServiceError};
+use planesweep_proto::{Credentials, Peer, PeerClient, Produced, ServiceError};
 
 /// The workers that maps can be fetched from.
 pub(crate) struct Peers {
-    token: Option<String>,
+    credentials: Credentials,
     known: Mutex<BTreeMap<WorkerId, (String, PeerClient)>>,
 }
 
 impl Peers {
-    /// None are known yet. All of them want the coordinator's token.
-    pub fn new(token: Option<String>) -> Self {
-        Self { token, known: Mutex::new(BTreeMap::new()) }
+    /// None are known yet. All of them want the coordinator's token, and its authority vouches for them.
+    pub fn new(credentials: Credentials) -> Self {
+        Self { credentials, known: Mutex::new(BTreeMap::new()) }
     }
 
     /// Notes where workers are.
@@ -27,7 +27,7 @@ impl Peers {
             if known.get(worker).is_some_and(|(is, _)| is == address) {
                 continue;
             }
-            match PeerClient::connect(address, self.token.as_deref()) {
+            match PeerClient::connect(address, &self.credentials) {
                 Ok(client) => drop(known.insert(worker.clone(), (address.clone(), client))),
                 Err(error) => tracing::warn!(%worker, %error, "a worker's address makes no sense"),
             }

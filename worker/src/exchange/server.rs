@@ -1,14 +1,13 @@
 //! What this worker has in memory, for others to fetch.
 
 use std::io;
-use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
 use planesweep_plan::BlobKey;
 use planesweep_proto::limits::{FETCH_CHUNK_BYTES, MAX_EXCHANGE_MESSAGE_BYTES};
 use planesweep_proto::wire::exchange_server::{Exchange, ExchangeServer};
-use planesweep_proto::{CheckToken, Code, ServiceError, bearer, wire};
+use planesweep_proto::{CheckToken, Code, Refusals, ServerTls, ServiceError, bearer, serve, wire};
 use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tokio::task::spawn_blocking;
@@ -16,10 +15,9 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::codegen::BoxStream;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::Server;
-use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status};
 
-use super::{ExchangeError, Inbox};
+use super::{ExchangeConfig, ExchangeError, Inbox};
 use crate::maps::Maps;
 
 /// How often a connection is probed, and how long the answer may take.
@@ -35,39 +33,43 @@ pub(crate) struct Served {
 }
 
 /// Serves maps, and the inbox if there is one. Beyond this host, only to those who have the token.
-pub(crate) async fn serve(
-    listen: SocketAddr,
+pub(crate) async fn start_serving(
+    config: &ExchangeConfig,
     host: &str,
     token: Option<&str>,
     maps: Arc<Maps>,
     inbox: Option<Arc<Inbox>>,
 ) -> Result<Served, ExchangeError> {
+    let listen = config.listen;
     if !listen.ip().is_loopback() && token.is_none() {
         return Err(ExchangeError::NoToken { listen });
     }
-    let token = token.map(bearer).transpose().map_err(ExchangeError::Token)?;
+    let expected = token.map(bearer).transpose().map_err(ExchangeError::Token)?;
+    let tls = config.tls.as_ref().map(ServerTls::acceptor).transpose()?;
+    let scheme = if tls.is_some() { "https" } else { "http" };
     let cannot_listen = |source: io::Error| ExchangeError::Listen { listen, source };
     let listener = TcpListener::bind(listen).await.map_err(cannot_listen)?;
     let local = listener.local_addr().map_err(cannot_listen)?;
     // Whoever listens everywhere is found by the name of the host.
     let address = if local.ip().is_unspecified() {
-        format!("http://{host}:{}", local.port())
+        format!("{scheme}://{host}:{}", local.port())
     } else {
-        format!("http://{local}")
+        format!("{scheme}://{local}")
     };
     let service = ExchangeServer::new(Service { maps, inbox, turns: Arc::new(Semaphore::new(MAX_FETCHES)) })
         .max_decoding_message_size(MAX_EXCHANGE_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_EXCHANGE_MESSAGE_BYTES);
     let stop = CancellationToken::new();
     let stopped = stop.clone().cancelled_owned();
-    let server = Server::builder()
-        .tcp_nodelay(true)
+    let refusals = Refusals::default();
+    let check = CheckToken { expected, refusals: refusals.clone() };
+    let router = Server::builder()
         .http2_keepalive_interval(Some(KEEP_ALIVE.0))
         .http2_keepalive_timeout(Some(KEEP_ALIVE.1))
-        .add_service(InterceptedService::new(service, CheckToken(token)))
-        .serve_with_incoming_shutdown(TcpIncoming::from(listener).with_nodelay(Some(true)), stopped);
+        .add_service(InterceptedService::new(service, check));
+    let server = serve(router, listener, tls, refusals, stopped);
     tokio::spawn(async move {
-        if let Err(error) = server.await {
+        if let Ok(Err(error)) = server.await {
             tracing::warn!(%error, "maps are served no longer");
         }
     });

@@ -16,7 +16,7 @@ use serde_json::{Value, json};
 use self::config::{BenchmarkConfig, INTERMEDIATE, Preset};
 use super::evaluate::{self, DtuArgs, EvaluateCommand, TntArgs};
 use super::{reconstruct, submit};
-use crate::args::{Cli, Command, TokenArgs};
+use crate::args::{Cli, Command, CredentialArgs};
 use crate::console::{Outcome, table};
 
 /// Arguments of `benchmark`.
@@ -34,7 +34,7 @@ pub struct BenchmarkArgs {
     #[arg(long, value_name = "URL")]
     pub coordinator: Option<String>,
     #[command(flatten)]
-    pub token: TokenArgs,
+    pub credentials: CredentialArgs,
 }
 
 /// A scene that was tried.
@@ -85,7 +85,7 @@ fn reconstruct_scene(
 ) -> Result<Outcome> {
     let arguments = match &args.coordinator {
         None => config.arguments(name, "reconstruct", &[]),
-        Some(url) => config.arguments(name, "submit", &args.token.passed_on(url)),
+        Some(url) => config.arguments(name, "submit", &args.credentials.passed_on(url)),
     };
     // An option that comes twice counts as it comes last, so that the file overrides the preset.
     let command = Cli::command().args_override_self(true);
