@@ -87,9 +87,11 @@ impl StoreError {
             && !self.io_kind().is_some_and(is_forbidden)
     }
 
-    /// Whether the disk has no room left.
-    pub fn is_disk_full(&self) -> bool {
-        self.io_kind().is_some_and(|kind| matches!(kind, ErrorKind::StorageFull | ErrorKind::QuotaExceeded))
+    /// The store whose disk has no room left, if that is the trouble.
+    pub fn full_disk(&self) -> Option<&str> {
+        let (Self::Write { url, .. } | Self::Read { url, .. }) = self else { return None };
+        let is_full = |kind| matches!(kind, ErrorKind::StorageFull | ErrorKind::QuotaExceeded);
+        self.io_kind().is_some_and(is_full).then_some(url)
     }
 
     /// What the system said, when it was the system.

@@ -32,8 +32,11 @@ pub(crate) async fn patiently<T, F: Future<Output = Result<T, StoreError>>>(
             return Err(error);
         }
         if !was_in_trouble {
-            let what = if error.is_disk_full() { "disk full" } else { "the store does not answer" };
-            tracing::warn!("{what}, trying again until it works: {}", with_causes(&error));
+            let trouble = match error.full_disk() {
+                Some(url) => format!("disk full at {url}"),
+                None => format!("the store does not answer ({})", with_causes(&error)),
+            };
+            tracing::warn!("{trouble}, trying again until it works");
         }
         was_in_trouble = true;
         tokio::select! {

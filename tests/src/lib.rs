@@ -24,6 +24,7 @@ mod scenes;
 mod scripts;
 mod shared_scenes;
 mod slurm;
+mod small_disk;
 
 pub use bench::Bench;
 pub use certificates::{Authority, ServerCertificate};
@@ -42,3 +43,4 @@ pub use scenes::{courtyard, plane, plane_of_size, seeded_weights, seeded_weights
 pub use scripts::{python, script, unavailable};
 pub use shared_scenes::shared_scenes;
 pub use slurm::{Slurm, free_port};
+pub use small_disk::SmallDisk;

@@ -1,6 +1,7 @@
 //! From the results in the store to the files that people use.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::io::{self, ErrorKind};
 use std::path::Path;
 use std::time::Instant;
 
@@ -78,7 +79,19 @@ struct ExportedView {
 }
 
 /// Writes the result folder.
-pub fn run(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Outcome> {
+pub fn run(run: &Finished<'_>, stages: Stages, begun: Instant) -> Result<Outcome> {
+    write(run, stages, begun).map_err(|error| {
+        let mut kinds = error.chain().filter_map(|cause| Some(cause.downcast_ref::<io::Error>()?.kind()));
+        if kinds.any(|kind| matches!(kind, ErrorKind::StorageFull | ErrorKind::QuotaExceeded)) {
+            let out = run.out.display();
+            error.context(format!("disk full at {out}; make room and run the same command again"))
+        } else {
+            error
+        }
+    })
+}
+
+fn write(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Outcome> {
     let writing = Instant::now();
     let scene = &run.prepared.input.scene;
     let planned = run.prepared.plan.views.iter().map(|v| (v.view, scene.views[&v.view].name.as_str()));

@@ -208,7 +208,12 @@ impl Driver {
 
     /// The step failed and was rolled back: what the ledger says holds.
     async fn recover(&mut self, error: &LedgerError) -> ServiceError {
-        let text = describe(error);
+        let text = if error.is_disk_full() {
+            // Nothing is decided until it can be written down: workers keep what they have, and report again.
+            format!("disk full at {}; nothing goes on until there is room", self.ledger.place())
+        } else {
+            describe(error)
+        };
         tracing::error!(error = text, "the ledger failed; it is read anew");
         self.seen = None;
         if let Err(error) = self.catch_up().await {

@@ -70,6 +70,14 @@ pub enum LedgerError {
 }
 
 impl LedgerError {
+    /// Whether the disk that the ledger lies on has no room left.
+    pub fn is_disk_full(&self) -> bool {
+        let (Self::Open { source, .. } | Self::Statement { source, .. }) = self else { return false };
+        let code = source.as_database_error().and_then(sqlx::error::DatabaseError::code);
+        // Of SQLite, and of PostgreSQL.
+        code.is_some_and(|code| code == "13" || code == "53100")
+    }
+
     /// For `map_err` on a statement.
     pub(super) fn statement(what: &'static str) -> impl Fn(sqlx::Error) -> Self {
         move |source| Self::Statement { what, source }

@@ -49,6 +49,7 @@ const CONNECTING: Duration = Duration::from_secs(4);
 pub struct Ledger {
     pool: AnyPool,
     kind: Kind,
+    place: LedgerPlace,
     /// Held for as long as the ledger is open: two coordinators on one SQLite file would each
     /// renew leases by a clock of their own.
     _lock: Option<File>,
@@ -105,7 +106,12 @@ impl Ledger {
             .await
             .map_err(failed)?;
         schema::create(&pool, kind, place).await?;
-        Ok(Self { pool, kind, _lock: lock })
+        Ok(Self { pool, kind, place: place.clone(), _lock: lock })
+    }
+
+    /// Where it lies.
+    pub fn place(&self) -> &LedgerPlace {
+        &self.place
     }
 
     /// Whether other coordinators may change it, too.
