@@ -81,6 +81,14 @@ impl Cluster {
         Running::start_in(&self.environment, given.iter().chain(more))
     }
 
+    /// Starts a worker with this fault, as `worker/src/fault_point.rs` has them.
+    pub fn faulty_worker(&self, fault: &str, more: &[&str]) -> Running {
+        let mut environment = self.environment.clone();
+        environment.push(("PLANESWEEP_FAULT", fault.to_owned()));
+        let given = ["worker", "--coordinator", &self.url, "--threads", "1"];
+        Running::start_in(&environment, given.iter().chain(more))
+    }
+
     /// What `planesweep status` says of a run.
     #[track_caller]
     pub fn status(&self, run: &str, more: &[&str]) -> Value {

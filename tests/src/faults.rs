@@ -33,6 +33,11 @@ pub fn is_alive(pid: u32) -> bool {
     stat(pid).is_some_and(|(state, _)| !"ZX".contains(state))
 }
 
+/// Whether a process stands still, as after SIGSTOP.
+pub fn is_frozen(pid: u32) -> bool {
+    stat(pid).is_some_and(|(state, _)| state == 'T')
+}
+
 /// Sends a signal, such as "KILL", to a process; whether it was there to get it.
 pub fn send(signal: &str, pid: u32) -> bool {
     let sent = Command::new("sh").arg("-c").arg(format!("kill -s {signal} {pid}")).status();

@@ -33,7 +33,7 @@ pub use containers::Containers;
 pub use convert_middlebury::{Bounds, convert_middlebury};
 pub use convert_rgbd::convert_rgbd;
 pub use data::{reference_weights, shared_data};
-pub use faults::{children, is_alive, send, wait_until};
+pub use faults::{children, is_alive, is_frozen, send, wait_until};
 pub use mounts::{can_mount, hiding, mounted};
 pub use postgres::Postgres;
 pub use program::{Finished, Running, program, run};

@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 
 use planesweep_plan::{NUMERICS_VERSION, WorkerId};
 use planesweep_proto::{
-    CODE_VERSION, Client, Credentials, Failure, Grant, JobAttempt, Order, Outcome, PROTOCOL_VERSION, Report,
-    ReportReply, Role, ServiceError, Slots, StorePlace, WorkerState,
+    Client, Credentials, Failure, Grant, JobAttempt, Order, Outcome, PROTOCOL_VERSION, Report, ReportReply,
+    Role, ServiceError, Slots, StorePlace, WorkerState,
 };
 use thiserror::Error;
 use tokio::sync::mpsc;
@@ -22,6 +22,7 @@ use crate::device::{BackendFactory, Device};
 use crate::disk_cache::DiskCache;
 use crate::exchange::{Exchange, ExchangeConfig, ExchangeError};
 use crate::failure::JobError;
+use crate::fault_point::{FaultPoint, code_version, pass};
 use crate::held::Held;
 use crate::jobs::Jobs;
 use crate::maps::Maps;
@@ -289,7 +290,7 @@ impl Agent {
         let is_ready = self.state == WorkerState::Ready;
         Report {
             protocol_version: PROTOCOL_VERSION,
-            code_version: CODE_VERSION.to_owned(),
+            code_version: code_version(),
             numerics_version: NUMERICS_VERSION,
             worker: self.identity.worker.clone(),
             sequence: self.sequence,
@@ -348,9 +349,18 @@ impl Agent {
             let (kind, view) = (grant.spec.kind(), grant.spec.view().map(|v| v.0));
             // The receiver lives as long as the loop; without it nobody needs to know.
             let begun = events.clone();
-            let started = move || drop(begun.try_send(Event::Started(attempt)));
+            let granted = Arc::new(grant);
+            let grant = Arc::clone(&granted);
+            let started = move || {
+                drop(begun.try_send(Event::Started(attempt)));
+                pass(FaultPoint::Started, &granted.spec);
+            };
             // On a task of its own, so that a panic ends the job and not the news of it.
-            let run = tokio::spawn(async move { jobs.run(&grant, &cancelled, started).await });
+            let run = tokio::spawn(async move {
+                let made = jobs.run(&grant, &cancelled, started).await?;
+                pass(FaultPoint::Stored, &grant.spec);
+                Ok(made)
+            });
             let result =
                 run.await.unwrap_or_else(|panic| Err(JobError::Panicked { message: panic.to_string() }));
             let event = match result {

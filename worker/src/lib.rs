@@ -23,6 +23,7 @@ mod device;
 mod disk_cache;
 mod exchange;
 mod failure;
+mod fault_point;
 mod files;
 mod held;
 mod images;

@@ -10,9 +10,11 @@ use std::time::Duration;
 use planesweep_coordinator::{Config, Coordinator, StartError};
 use planesweep_plan::{Attempt, Job, NUMERICS_VERSION, RunId, WorkerId};
 use planesweep_proto::wire::coordinator_client::CoordinatorClient;
-use planesweep_proto::{CODE_VERSION, Client, Code, JobState, PROTOCOL_VERSION, ServiceError, SubmitHeader};
+use planesweep_proto::{
+    CODE_VERSION, Client, Code, JobState, Outcome, PROTOCOL_VERSION, ServiceError, SubmitHeader,
+};
 
-use toy::{DEADLINE, Place, Toy, cloud, config, finished, plan, start, submit, undisturbed};
+use toy::{DEADLINE, Place, Toy, cloud, config, finished, plan, result_of, start, submit, undisturbed};
 
 /// What every ledger must do.
 macro_rules! on_every_ledger {
@@ -98,6 +100,15 @@ async fn a_silent_worker_loses_its_job_and_its_late_result_is_refused(place: Pla
     assert_eq!(reply.acknowledged.len(), 1, "it may forget the result");
     let status = handle.status(&run, 0).await.expect("a status");
     assert_eq!((status.late_results, status.divergent_results, status.workers_alive), (1, 0, 2));
+
+    // One that made something else of it is counted, too.
+    let mut different = result_of(&grant);
+    different.blob.0[0] ^= 1;
+    frozen.end(&grant, Outcome::Success(different));
+    frozen.report().await.expect("an answer");
+    let status = handle.status(&run, 0).await.expect("a status");
+    assert_eq!((status.late_results, status.divergent_results), (2, 1));
+    assert_eq!(cloud(&handle, &run).await, undisturbed(&jobs));
     handle.shutdown().await;
     worker.await.expect("no panic");
 }
