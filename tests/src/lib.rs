@@ -15,7 +15,6 @@ mod convert_rgbd;
 mod data;
 mod faults;
 mod mounts;
-#[path = "../../coordinator/tests/cluster/postgres.rs"]
 mod postgres;
 mod program;
 mod results;

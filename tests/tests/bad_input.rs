@@ -163,3 +163,13 @@ fn names_that_lead_out_of_the_scene_are_refused() {
     assert_eq!(left_out.len(), 1, "{left_out:?}");
     assert_eq!(left_out[0].0, "../secret1.p");
 }
+
+#[test]
+fn two_views_are_enough() {
+    let bench = of_plane(2);
+    let more: Vec<&str> = ANALYTIC.into_iter().chain(["--views", "5"]).collect();
+    let _ = bench.reconstruct("out", &more).expect_code(0);
+    let record: serde_json::Value = serde_json::from_slice(&bench.read("out/run.json")).expect("JSON");
+    let sources = record["views"].as_array().expect("a list").iter().map(|view| view["sources"].clone());
+    assert_eq!(sources.collect::<Vec<_>>(), [serde_json::json!([1]), serde_json::json!([0])]);
+}

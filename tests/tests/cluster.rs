@@ -16,8 +16,7 @@ const SLOW: [&str; 2] = ["--depths", "128"];
 /// Slow enough for two, although workers go on with what they hold meanwhile.
 const SLOWER: [&str; 2] = ["--depths", "512"];
 const TORCH: [&str; 2] = ["--device", "torch"];
-/// Exit codes of a worker.
-const REFUSED: i32 = 78;
+/// The exit code of a worker that another one may replace.
 const TERMINATED: i32 = 75;
 
 fn of_courtyard() -> Bench {
@@ -98,19 +97,23 @@ fn a_cluster_gives_the_cloud_of_one_process_and_is_told_to_go() {
 }
 
 #[test]
-fn killed_workers_cost_no_view() {
+fn a_run_waits_when_all_workers_are_gone_and_says_so_and_new_ones_carry_on() {
     let bench = of_courtyard();
     calm(&bench, &SLOW);
     let cluster = Cluster::start(&bench, &[]);
     let mut workers = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
-    let mut struck = bench.submit("struck", &cluster, &SLOW);
+    let struck = bench.submit("struck", &cluster, &SLOW);
     wait_for_results(&struck, 1);
     for worker in &mut workers {
         assert!(worker.is_running() && send("KILL", worker.pid()));
     }
     assert!(wait_until(DEADLINE, || workers.iter().all(|worker| !is_alive(worker.pid()))));
-    assert!(struck.is_running(), "{}", struck.stderr());
+    let says = |what: &str| wait_until(DEADLINE, || struck.stderr().contains(what));
+    assert!(says("no worker is alive; waiting for one"), "{}", struck.stderr());
+    let waiting = cluster.status("scene-1", &[])["waiting_seconds"].as_f64();
+    assert!(waiting > Some(0.0), "{waiting:?}");
     let _successors = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
+    assert!(says("workers are back"), "{}", struck.stderr());
     let _ = struck.wait().expect_code(0);
     same_cloud(&bench, "calm", "struck");
 }
@@ -196,23 +199,52 @@ fn an_s3_store_that_is_gone_for_a_while_loses_nothing() {
 }
 
 #[test]
-fn who_has_no_token_is_refused_and_other_hosts_are_not_let_in_without_one() {
-    let bench = Bench::new(|folder| courtyard(folder, 3, 96, 96));
-    let (ledger, store) = (bench.path("ledger.sqlite"), bench.path("store"));
-    let open = ["coordinator", "--listen", "0.0.0.0:0", "--ledger", &ledger, "--store", &store];
-    let refused = run(open).expect_code(1);
-    assert!(refused.stderr.contains("a token is needed"), "{}", refused.stderr);
-
-    let (token, wrong) = (bench.path("token"), bench.path("wrong"));
-    std::fs::write(&token, "s3cret\n").expect("written");
-    std::fs::write(&wrong, "secret\n").expect("written");
-    let cluster = Cluster::start(&bench, &["--token-file", &token]);
-    let _worker = cluster.worker(&["--token-file", &token]);
-    for more in [&[][..], &["--token-file", &wrong]] {
-        let refused = bench.submit("out", &cluster, more).wait().expect_code(1);
-        assert!(refused.stderr.contains("unauthenticated"), "{}", refused.stderr);
-        let refused = cluster.worker(more).wait().expect_code(REFUSED);
-        assert!(refused.stderr.contains("unauthenticated"), "{}", refused.stderr);
+fn a_postgres_that_restarts_in_the_middle_of_a_run_loses_nothing() {
+    let test = "a_postgres_that_restarts_in_the_middle_of_a_run_loses_nothing";
+    let Some(mut postgres) = Postgres::start(test) else { return };
+    let bench = of_courtyard();
+    calm(&bench, &SLOW);
+    let cluster = Cluster::start_on(&postgres.url(), &bench.path("store"), Vec::new(), &["-v"]);
+    let workers = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
+    let mut struck = bench.submit("struck", &cluster, &SLOW);
+    wait_for_results(&struck, 1);
+    postgres.go_away();
+    let is_noticed = || cluster.coordinator_stderr().contains("the ledger does not answer");
+    assert!(wait_until(DEADLINE, is_noticed), "{}", cluster.coordinator_stderr());
+    let cannot = |worker: &Running| worker.stderr().contains("cannot report to the coordinator");
+    assert!(wait_until(DEADLINE, || workers.iter().any(cannot)), "{}", workers[0].stderr());
+    assert!(struck.is_running() && postgres.come_back(), "{}", struck.stderr());
+    let _ = struck.wait().expect_code(0);
+    let said = cluster.coordinator_stderr();
+    for wrong in ["died or froze", "tried again", "failed for good"] {
+        assert!(!said.contains(wrong), "{wrong}: {said}");
     }
-    let _ = bench.submit("out", &cluster, &["--token-file", &token]).wait().expect_code(0);
+    same_cloud(&bench, "calm", "struck");
+}
+
+#[test]
+fn a_coordinator_told_twice_to_stop_stops_at_once_and_goes_on_later() {
+    let bench = of_courtyard();
+    calm(&bench, &SLOW);
+    let (ledger, store) = (bench.path("ledger.sqlite"), bench.path("store"));
+    let mut cluster = Cluster::start(&bench, &[]);
+    let workers = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
+    let struck = bench.submit("struck", &cluster, &SLOW);
+    wait_for_results(&struck, 1);
+    for answer in ["once more stops at once", "stopping at once"] {
+        assert!(cluster.coordinator().is_running() && send("INT", cluster.coordinator().pid()));
+        let is_answered = || cluster.coordinator_stderr().contains(answer);
+        assert!(wait_until(DEADLINE, is_answered), "{}", cluster.coordinator_stderr());
+    }
+    assert!(wait_until(DEADLINE, || !cluster.coordinator().is_running()), "it does not stop");
+    // Its workers are told, too, or find nobody to report to.
+    drop(workers);
+    drop(struck);
+    let again = Cluster::start_on(&ledger, &store, Vec::new(), &[]);
+    let unfinished = again.status("scene-1", &[]);
+    assert_eq!(unfinished["state"], "running", "{unfinished}");
+    let _workers = [again.worker(&TORCH), again.worker(&TORCH)];
+    let resumed = bench.submit("struck", &again, &SLOW).wait().expect_code(0);
+    assert!(resumed.stderr.contains("of 25 jobs are done already"), "{}", resumed.stderr);
+    same_cloud(&bench, "calm", "struck");
 }

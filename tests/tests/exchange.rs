@@ -31,9 +31,13 @@ fn same_cloud(bench: &Bench, one: &str, other: &str) {
     assert!(read(one).len() > 10_000 && read(one) == read(other), "{one} and {other} differ");
 }
 
-/// Runs with a shared memory of its own, mounted with these options.
-fn start_with_memory(bench: &Bench, options: &str, out: &str, run: &str) -> Running {
-    let mount = format!("mount -t tmpfs -o {options} tmpfs /dev/shm");
+/// A `/dev` with nothing in it but what every program needs.
+const BARE_DEV: &str = "dev=$(mktemp -d) && mount -t tmpfs tmpfs $dev && \
+    for d in null zero full random urandom tty; do touch $dev/$d && mount --bind /dev/$d $dev/$d || exit 9; done; \
+    mount --rbind $dev /dev && [ ! -e /dev/shm ]";
+
+/// Runs with a shared memory of its own, which this command makes.
+fn start_with_memory(bench: &Bench, mount: &str, out: &str, run: &str) -> Running {
     let script = format!("exec unshare -m sh -c '{mount} || exit 9; {run}' \"$0\" \"$@\"");
     bench.start_in_script(&script, out, &APART)
 }
@@ -70,10 +74,12 @@ fn full_and_absent_shared_memory_is_done_without() {
     }
     let bench = of_courtyard();
     let _ = bench.reconstruct("alone", &ALONE).expect_code(0);
-    for (out, options, said) in
-        [("full", "size=2m", "MiB left"), ("absent", "ro", "there is no shared memory")]
-    {
-        let run = start_with_memory(&bench, options, out, "exec \"$0\" \"$@\"").wait().expect_code(0);
+    for (out, mount, said) in [
+        ("full", "mount -t tmpfs -o size=2m tmpfs /dev/shm", "MiB left"),
+        ("read-only", "mount -t tmpfs -o ro tmpfs /dev/shm", "there is no shared memory"),
+        ("absent", BARE_DEV, "there is no shared memory"),
+    ] {
+        let run = start_with_memory(&bench, mount, out, "exec \"$0\" \"$@\"").wait().expect_code(0);
         assert_eq!(run.stderr.matches(WARNING).count(), 1, "{}", run.stderr);
         assert!(run.stderr.contains(said), "{}", run.stderr);
         assert!(!run.stderr.contains("ended before its time"), "{}", run.stderr);
@@ -101,7 +107,9 @@ fn shared_memory_that_fills_up_in_the_middle_ends_no_worker() {
         wait $run; code=$?
         echo "filled: $filled" >&2
         exit $code"#;
-    let run = start_with_memory(&bench, "size=24m", "filled", run).wait().expect_code(0);
+    let run = start_with_memory(&bench, "mount -t tmpfs -o size=24m tmpfs /dev/shm", "filled", run)
+        .wait()
+        .expect_code(0);
     assert!(run.stderr.contains("filled: yes"), "{}", run.stderr);
     assert!(maps(&run, "by shared memory") > 0, "{}", run.stdout);
     assert!(!run.stderr.contains("ended before its time"), "{}", run.stderr);

@@ -1,5 +1,6 @@
 //! A coordinator and toy workers over real sockets, in one process.
 
+#[path = "../../../tests/src/postgres.rs"]
 mod postgres;
 mod shared;
 mod submissions;
