@@ -253,7 +253,9 @@ async fn nobody_is_served_without_the_token() {
         async move { start_serving(&config, "host", token, Arc::new(Maps::new(0)), None).await }
     };
     let open = ExchangeConfig { listen: ([0, 0, 0, 0], 0).into(), tls: None, shared_memory: false };
-    assert!(matches!(open.check("https://head:7070"), Err(ExchangeError::NoTls { .. })));
+    for coordinators in ["https://head:7070", "http://one:7070,https://two:7070"] {
+        assert!(matches!(open.check(coordinators), Err(ExchangeError::NoTls { .. })), "{coordinators}");
+    }
     assert!(open.check("http://head:7070").is_ok());
     assert!(matches!(served("0.0.0.0:0", None).await, Err(ExchangeError::NoToken { .. })));
     let everywhere = served("0.0.0.0:0", Some("token")).await.expect("with a token");

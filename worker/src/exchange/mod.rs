@@ -62,10 +62,10 @@ pub struct ExchangeConfig {
 }
 
 impl ExchangeConfig {
-    /// Checks that a worker of this coordinator may serve its maps so.
+    /// Checks that a worker of this coordinator, or of these, may serve its maps so.
     pub(crate) fn check(&self, coordinator: &str) -> Result<(), ExchangeError> {
         let is_guarded = self.tls.is_some() || self.listen.ip().is_loopback();
-        if coordinator.starts_with("https://") && !is_guarded {
+        if coordinator.contains("https://") && !is_guarded {
             return Err(ExchangeError::NoTls { listen: self.listen });
         }
         Ok(())
