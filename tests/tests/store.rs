@@ -102,6 +102,27 @@ fn a_coordinator_is_a_store() {
 }
 
 #[test]
+fn a_coordinator_never_has_a_large_blob_as_a_whole_in_memory() {
+    const BLOB: usize = 256 << 20;
+    let bench = Bench::new(|_| {});
+    let mut cluster = Cluster::start(&bench, &[]);
+    let (runtime, store) = through(&cluster);
+    let pid = cluster.coordinator().pid();
+    let most_mib = || {
+        let status = fs::read_to_string(format!("/proc/{pid}/status")).expect("it runs");
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).expect("a peak");
+        line.trim().trim_end_matches(" kB").parse::<usize>().expect("a number") >> 10
+    };
+    let before = most_mib();
+    let bytes: Bytes = (0..BLOB / 4).flat_map(|k| (k as u32).to_le_bytes()).collect::<Vec<u8>>().into();
+    let key = runtime.block_on(store.put(bytes.clone())).expect("written");
+    assert!(runtime.block_on(store.get(&key)).expect("read") == bytes);
+    let more = most_mib() - before;
+    eprintln!("{more} MiB for a blob of {} MiB", BLOB >> 20);
+    assert!(more < BLOB >> 21, "{more} MiB");
+}
+
+#[test]
 fn another_store_at_the_same_address_is_not_taken_for_it() {
     let folder = tempfile::tempdir().expect("a folder");
     let url = format!("file://{}", folder.path().display());
