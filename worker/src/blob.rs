@@ -57,7 +57,7 @@ pub fn depth_map_bytes(map: &DepthMap) -> usize {
     HEADER_BYTES + map.width() * map.height() * DEPTH_MAP_PIXEL_BYTES
 }
 
-/// A depth map from [`encode_depth_map`]'s bytes.
+/// A depth map from the bytes of `encode_depth_map`.
 pub fn decode_depth_map(bytes: &[u8]) -> Result<DepthMap, BlobError> {
     let mut reader = Reader { bytes, total: bytes.len() };
     let camera = reader.header(DEPTH_MAP, "depth map", DEPTH_MAP_PIXEL_BYTES)?;
