@@ -128,7 +128,10 @@ fn a_scene_of_any_format_gives_the_same_cloud() {
         let _ = run(["convert", &bench.scene(), &scene, "--to", format]).expect_code(0);
         let of_format = points(&scene, &out);
         // A camera matrix written as text may have another last digit.
-        assert!((of_format / of_colmap - 1.0).abs() < 0.01, "{format}: {of_format} points, COLMAP {of_colmap}");
+        assert!(
+            (of_format / of_colmap - 1.0).abs() < 0.01,
+            "{format}: {of_format} points, COLMAP {of_colmap}"
+        );
     }
 }
 
