@@ -30,7 +30,7 @@ pub(crate) fn gradient_sums(
 ) -> Vec<[f64; 2]> {
     check(z, output, affine.len());
     let mut sums = vec![[0.0; 2]; affine.len()];
-    run_sums(level, &mut Sums { z, output, affine, sums: &mut sums });
+    run_sums(level, &mut GradientSums { z, output, affine, totals: &mut sums });
     sums
 }
 
@@ -89,11 +89,11 @@ struct Moments<'a> {
     sums: &'a mut [[f64; 2]],
 }
 
-struct Sums<'a> {
+struct GradientSums<'a> {
     z: Columns<'a>,
     output: Columns<'a>,
     affine: &'a [Affine],
-    sums: &'a mut [[f64; 2]],
+    totals: &'a mut [[f64; 2]],
 }
 
 struct Gradient<'a> {
@@ -106,7 +106,7 @@ struct Gradient<'a> {
 
 by_level!(run_apply(task: &mut Apply<'_>) = apply_to[][]);
 by_level!(run_moments(task: &mut Moments<'_>) = moments_of[][]);
-by_level!(run_sums(task: &mut Sums<'_>) = sums_of[][]);
+by_level!(run_sums(task: &mut GradientSums<'_>) = sums_of[][]);
 by_level!(run_gradient(task: &mut Gradient<'_>) = gradient_of[][]);
 
 /// # Safety
@@ -157,9 +157,9 @@ unsafe fn moments_of<S: Simd>(task: &mut Moments<'_>) {
 /// # Safety
 /// As `moments_of`; the sizes are those `gradient_sums` checks.
 #[inline(always)]
-unsafe fn sums_of<S: Simd>(task: &mut Sums<'_>) {
+unsafe fn sums_of<S: Simd>(task: &mut GradientSums<'_>) {
     let (shape, output) = (task.z.shape(), task.output.shape());
-    for (channel, (sums, [scale, shift])) in task.sums.iter_mut().zip(task.affine).enumerate() {
+    for (channel, (sums, [scale, shift])) in task.totals.iter_mut().zip(task.affine).enumerate() {
         let (scale, shift) = (S::splat(*scale), S::splat(*shift));
         let mut lanes = [S::splat(0.0); 2];
         for x in 0..shape.columns {

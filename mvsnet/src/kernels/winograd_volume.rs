@@ -100,7 +100,7 @@ unsafe fn block<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(task: &mut 
     let values = task.scratch.0.values_mut().as_mut_ptr();
     let products = values.add(ROWS * row_size);
     let rows = task.rows.clone();
-    for row in rows.start.saturating_sub(1)..rows.start + 1 {
+    for row in rows.start.saturating_sub(1)..=rows.start {
         transform_row::<S, VECTORS>(task, row, at, values.add(row % ROWS * row_size));
     }
     for y in rows.clone() {
