@@ -31,7 +31,7 @@ use std::time::Duration;
 
 use planesweep_plan::JobId;
 use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
-use sqlx::{AnyPool, Executor};
+use sqlx::{AnyPool, Connection, Executor};
 use url::Url;
 
 pub use error::LedgerError;
@@ -102,6 +102,9 @@ impl Ledger {
                     Ok(())
                 })
             })
+            // When a commit fails for want of room, SQLite has rolled back already, and the connection counts a
+            // transaction for ever that no longer is; another connection takes its place.
+            .before_acquire(|connection, _| Box::pin(async move { Ok(!connection.is_in_transaction()) }))
             .connect_with(options)
             .await
             .map_err(failed)?;
