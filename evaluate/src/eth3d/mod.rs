@@ -2,8 +2,8 @@
 //! against laser scans, at several tolerances.
 //!
 //! A point of the cloud is accurate when a scan has a point near it, inaccurate when it stands where a
-//! laser beam went through ([`observe`]), and unobserved otherwise; unobserved points count nowhere. Both
-//! figures are means over the cells of two grids ([`cell_means`]), so that dense places weigh no more.
+//! laser beam went through (`observe`), and unobserved otherwise; unobserved points count nowhere. Both
+//! figures are means over the cells of two grids (`cell_means`), so that dense places weigh no more.
 
 mod cells;
 mod observe;
