@@ -45,6 +45,10 @@ impl Supervisor {
                 command.args(["--memory", &bytes.to_string()]);
             }
             command.args(std::iter::repeat_n("-v", verbose.into()));
+            // These are for coordinators elsewhere; this one is on the loopback interface, without TLS.
+            for variable in ["PLANESWEEP_TLS_CA", "PLANESWEEP_TLS_CERT", "PLANESWEEP_TLS_KEY"] {
+                command.env_remove(variable);
+            }
             command.stdin(Stdio::piped()).stdout(Stdio::null()).kill_on_drop(true);
             slots.spawn(keep_alive(slot, command, orders.clone()));
         }

@@ -122,7 +122,7 @@ pub struct RunStatus {
     pub late_results: u64,
     /// Those of them that differed from the published result.
     pub divergent_results: u64,
-    /// Callers without the token, with a wrong one, or without TLS, since the coordinator started.
+    /// Callers without the token, with a wrong one, or without a TLS handshake that ended well, since the coordinator started.
     pub refused_callers: u64,
 }
 

@@ -143,7 +143,7 @@ fn handshakes(
                     // Nothing was said, as by a probe of the port.
                     Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => {}
                     Err(error) => {
-                        tracing::warn!(%error, "a caller that does not trust the certificate is refused");
+                        tracing::warn!(%error, "a handshake failed, and the caller is refused");
                         refusals.count();
                     }
                 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt};
+use object_store::{ObjectStore, ObjectStoreExt, PutMode};
 use planesweep_plan::{BlobHasher, BlobKey};
 use tokio_stream::{Stream, StreamExt};
 
@@ -66,9 +66,15 @@ impl Objects {
         if let Some(said) = self.said_identity().await? {
             return Ok(said);
         }
-        self.say_identity(new).await?;
-        // Another coordinator may have done the same.
-        Ok(self.said_identity().await?.unwrap_or_else(|| new.to_owned()))
+        let (place, create) = (Path::from(IDENTITY), PutMode::Create.into());
+        match self.objects.put_opts(&place, new.to_owned().into(), create).await {
+            Ok(_) => Ok(new.to_owned()),
+            // Another coordinator was faster: its word holds.
+            Err(object_store::Error::AlreadyExists { .. }) => {
+                Ok(self.said_identity().await?.unwrap_or_else(|| new.to_owned()))
+            }
+            Err(error) => Err(self.cannot_open(&error)),
+        }
     }
 
     async fn say_identity(&self, identity: &str) -> Result<(), StoreError> {

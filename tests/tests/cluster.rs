@@ -35,12 +35,6 @@ fn wait_for_results(run: &Running, count: usize) {
     assert!(wait_until(DEADLINE, is_there), "no result: {}", run.stderr());
 }
 
-#[track_caller]
-fn same_cloud(bench: &Bench, one: &str, other: &str) {
-    let read = |out: &str| bench.read(&format!("{out}/cloud.ply"));
-    assert!(read(one).len() > 10_000 && read(one) == read(other), "{one} and {other} differ");
-}
-
 #[test]
 fn a_cluster_gives_the_cloud_of_one_process_and_is_told_to_go() {
     let bench = Bench::new(|folder| courtyard(folder, 4, 160, 128));
@@ -115,7 +109,7 @@ fn a_run_waits_when_all_workers_are_gone_and_says_so_and_new_ones_carry_on() {
     let _successors = [cluster.worker(&TORCH), cluster.worker(&TORCH)];
     assert!(says("workers are back"), "{}", struck.stderr());
     let _ = struck.wait().expect_code(0);
-    same_cloud(&bench, "calm", "struck");
+    bench.same_cloud("calm", "struck");
 }
 
 #[test]
@@ -138,7 +132,7 @@ fn a_killed_coordinator_is_restarted_and_loses_nothing() {
         .map(|kind| status["jobs"][kind]["done"].as_u64().unwrap_or(0))
         .sum();
     assert_eq!(done, 25, "{status}");
-    same_cloud(&bench, "calm", "struck");
+    bench.same_cloud("calm", "struck");
 }
 
 #[test]
@@ -166,7 +160,7 @@ fn of_two_coordinators_one_goes_and_the_workers_stay() {
     assert!(struck.is_running() && workers.iter_mut().all(Running::is_running), "{}", struck.stderr());
     assert!(wait_until(DEADLINE, || alive_at(&staying) == 2), "{}", workers[0].stderr());
     let _ = struck.wait().expect_code(0);
-    same_cloud(&bench, "calm", "struck");
+    bench.same_cloud("calm", "struck");
 
     // Both have said that they go, as far as the workers know.
     let _ = staying.drain().wait().expect_code(0);
@@ -195,7 +189,7 @@ fn an_s3_store_that_is_gone_for_a_while_loses_nothing() {
     assert!(wait_until(DEADLINE, is_mended), "{}", workers[0].stderr());
     let status = run(["status", "scene-1", "--coordinator", cluster.url(), "--json"]).expect_code(0).json();
     assert_eq!(status["failures"], serde_json::json!([]));
-    same_cloud(&bench, "calm", "struck");
+    bench.same_cloud("calm", "struck");
 }
 
 #[test]
@@ -219,7 +213,7 @@ fn a_postgres_that_restarts_in_the_middle_of_a_run_loses_nothing() {
     for wrong in ["died or froze", "tried again", "failed for good"] {
         assert!(!said.contains(wrong), "{wrong}: {said}");
     }
-    same_cloud(&bench, "calm", "struck");
+    bench.same_cloud("calm", "struck");
 }
 
 #[test]
@@ -246,5 +240,5 @@ fn a_coordinator_told_twice_to_stop_stops_at_once_and_goes_on_later() {
     let _workers = [again.worker(&TORCH), again.worker(&TORCH)];
     let resumed = bench.submit("struck", &again, &SLOW).wait().expect_code(0);
     assert!(resumed.stderr.contains("of 25 jobs are done already"), "{}", resumed.stderr);
-    same_cloud(&bench, "calm", "struck");
+    bench.same_cloud("calm", "struck");
 }

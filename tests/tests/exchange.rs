@@ -25,12 +25,6 @@ fn maps(run: &Finished, way: &str) -> u64 {
     run.json()["report"]["maps_by_way"][way].as_u64().expect("a number of maps")
 }
 
-#[track_caller]
-fn same_cloud(bench: &Bench, one: &str, other: &str) {
-    let read = |out: &str| bench.read(&format!("{out}/cloud.ply"));
-    assert!(read(one).len() > 10_000 && read(one) == read(other), "{one} and {other} differ");
-}
-
 /// A `/dev` with nothing in it but what every program needs.
 const BARE_DEV: &str = "dev=$(mktemp -d) && mount -t tmpfs tmpfs $dev && \
     for d in null zero full random urandom tty; do touch $dev/$d && mount --bind /dev/$d $dev/$d || exit 9; done; \
@@ -53,7 +47,7 @@ fn maps_reach_the_fusion_worker_through_shared_memory() {
     // All but those that were made before the fusion worker had reported.
     assert!(maps(&apart, "by shared memory") >= 4, "{}", apart.stdout);
     assert!(!apart.stderr.contains(WARNING), "{}", apart.stderr);
-    same_cloud(&bench, "alone", "apart");
+    bench.same_cloud("alone", "apart");
 }
 
 #[test]
@@ -64,7 +58,7 @@ fn workers_that_share_no_memory_send_maps_as_streams() {
     let pair = bench.reconstruct("pair", &pair).expect_code(0);
     assert!(maps(&pair, "by stream") > 0, "{}", pair.stdout);
     assert_eq!(maps(&pair, "by shared memory"), 0, "{}", pair.stdout);
-    same_cloud(&bench, "alone", "pair");
+    bench.same_cloud("alone", "pair");
 }
 
 #[test]
@@ -85,7 +79,7 @@ fn full_and_absent_shared_memory_is_done_without() {
         assert!(!run.stderr.contains("ended before its time"), "{}", run.stderr);
         assert_eq!(maps(&run, "by shared memory"), 0, "{}", run.stdout);
         assert!(maps(&run, "by stream") > 0, "{}", run.stdout);
-        same_cloud(&bench, "alone", out);
+        bench.same_cloud("alone", out);
     }
 }
 
@@ -113,7 +107,7 @@ fn shared_memory_that_fills_up_in_the_middle_ends_no_worker() {
     assert!(run.stderr.contains("filled: yes"), "{}", run.stderr);
     assert!(maps(&run, "by shared memory") > 0, "{}", run.stdout);
     assert!(!run.stderr.contains("ended before its time"), "{}", run.stderr);
-    same_cloud(&bench, "alone", "filled");
+    bench.same_cloud("alone", "filled");
 }
 
 #[test]
@@ -140,5 +134,5 @@ fn killed_ends_of_shared_memory_are_replaced_and_change_no_byte() {
     let run = run.wait().expect_code(0);
     assert_eq!(run.stderr.matches("a worker ended before its time").count(), 2, "{}", run.stderr);
     assert!(maps(&run, "by shared memory") > 0, "{}", run.stdout);
-    same_cloud(&bench, "alone", "struck");
+    bench.same_cloud("alone", "struck");
 }

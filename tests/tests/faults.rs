@@ -40,12 +40,6 @@ fn two_workers(run: &Running) -> [u32; 2] {
     [found[0], found[1]]
 }
 
-#[track_caller]
-fn same_cloud(bench: &Bench, one: &str, other: &str) {
-    let read = |out: &str| bench.read(&format!("{out}/cloud.ply"));
-    assert!(read(one).len() > 10_000 && read(one) == read(other), "{one} and {other} differ");
-}
-
 /// Whether an interrupted run was taken up where it was.
 fn was_resumed(run: &Finished) -> bool {
     run.stderr.contains("25 jobs are done already") && !run.stderr.contains("25 of 25 jobs")
@@ -66,7 +60,7 @@ fn a_killed_worker_is_replaced_and_its_job_done_again() {
     let run = run.wait().expect_code(0);
     assert!(run.stderr.contains("a worker ended before its time"), "{}", run.stderr);
     assert!(run.stderr.contains("died or froze while it ran this job"), "{}", run.stderr);
-    same_cloud(&bench, "calm", "struck");
+    bench.same_cloud("calm", "struck");
 }
 
 #[test]
@@ -84,7 +78,7 @@ fn a_frozen_worker_is_done_without_and_changes_no_byte() {
     assert!(send("CONT", worker));
     let run = run.wait().expect_code(0);
     assert!(run.stderr.contains("died or froze while it ran this job"), "{}", run.stderr);
-    same_cloud(&bench, "calm", "struck");
+    bench.same_cloud("calm", "struck");
 }
 
 #[test]
@@ -97,7 +91,7 @@ fn a_worker_frozen_for_good_does_not_keep_the_run_from_its_end() {
     let _ = run.wait().expect_code(0);
     assert!(wait_until(DEADLINE, || !is_alive(worker)), "the frozen worker outlives the run");
     let _ = bench.reconstruct("calm", &COURTYARD).expect_code(0);
-    same_cloud(&bench, "calm", "struck");
+    bench.same_cloud("calm", "struck");
 }
 
 #[test]
@@ -116,7 +110,7 @@ fn a_killed_run_leaves_no_worker_and_is_resumed() {
     assert!(!Path::new(&bench.path("struck/cloud.ply")).exists());
     let again = bench.reconstruct("struck", &COURTYARD).expect_code(0);
     assert!(was_resumed(&again), "{}", again.stderr);
-    same_cloud(&bench, "calm", "struck");
+    bench.same_cloud("calm", "struck");
 }
 
 #[test]
@@ -139,7 +133,7 @@ fn ctrl_c_stops_a_run_that_can_go_on() {
         assert!(workers.into_iter().all(|worker| !is_alive(worker)));
         let again = bench.reconstruct(out, &COURTYARD).expect_code(0);
         assert!(was_resumed(&again), "{}", again.stderr);
-        same_cloud(&bench, "calm", out);
+        bench.same_cloud("calm", out);
     }
 }
 
@@ -161,12 +155,12 @@ fn spoilt_and_missing_blobs_are_found_and_made_again() {
     }
     let again = bench.reconstruct("struck", &analytic).expect_code(0);
     assert!(again.stderr.contains("are lost or damaged and are made again"), "{}", again.stderr);
-    same_cloud(&bench, "calm", "struck");
+    bench.same_cloud("calm", "struck");
 
     for lost in stored.chunks(2) {
         fs::remove_file(&lost[0]).expect("lost");
     }
     let again = bench.reconstruct("struck", &analytic).expect_code(0);
     assert!(again.stderr.contains("are lost or damaged and are made again"), "{}", again.stderr);
-    same_cloud(&bench, "calm", "struck");
+    bench.same_cloud("calm", "struck");
 }

@@ -50,12 +50,6 @@ fn images_fetched(run: &Finished) -> u64 {
     run.json()["report"]["images_fetched"].as_u64().expect("a number of photographs")
 }
 
-#[track_caller]
-fn same_cloud(bench: &Bench, one: &str, other: &str) {
-    let read = |out: &str| bench.read(&format!("{out}/cloud.ply"));
-    assert!(read(one).len() > 10_000 && read(one) == read(other), "{one} and {other} differ");
-}
-
 #[test]
 fn an_address_and_a_token_are_enough_and_no_photograph_comes_twice() {
     if !can_mount("an_address_and_a_token_are_enough_and_no_photograph_comes_twice") {
@@ -75,7 +69,7 @@ fn an_address_and_a_token_are_enough_and_no_photograph_comes_twice() {
     assert!(first.stderr.contains("4 of 4 photographs and masks uploaded"), "{}", first.stderr);
     assert!(first.stderr.contains(THROUGH) && worker.stderr().contains(THROUGH), "{}", worker.stderr());
     assert_eq!((images_fetched(&first), kept(&bench)), (4, 4), "{}", worker.stderr());
-    same_cloud(&bench, "alone", "first");
+    bench.same_cloud("alone", "first");
     assert!(send("TERM", worker.pid()));
     let _ = worker.wait().expect_code(TERMINATED);
 
@@ -139,5 +133,5 @@ fn a_worker_killed_while_it_downloads_leaves_nothing_half() {
     let run = run.wait().expect_code(0);
     assert_eq!(images_fetched(&run), u64::from(VIEWS) - kept_then as u64, "the rest, and only the rest");
     assert_eq!(kept(&bench), VIEWS as usize);
-    same_cloud(&bench, "alone", "struck");
+    bench.same_cloud("alone", "struck");
 }

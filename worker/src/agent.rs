@@ -133,7 +133,7 @@ pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result
         events,
         exchange: Arc::new(exchange),
         jobs: None,
-        is_opening: false,
+        has_begun_to_open: false,
         unopened: Some(Unopened { device, maps, cache_bytes: config.cache_bytes, disk_cache }),
         max_wait: FIRST_WAIT,
         lease_ends: None,
@@ -183,7 +183,7 @@ struct Agent {
     exchange: Arc<Exchange>,
     /// Made when the store is found, of which the first reply tells.
     jobs: Option<Arc<Jobs>>,
-    is_opening: bool,
+    has_begun_to_open: bool,
     unopened: Option<Unopened>,
     max_wait: Duration,
     lease_ends: Option<Instant>,
@@ -319,8 +319,8 @@ impl Agent {
 
     /// Does what a reply says; whether it said anything.
     fn apply(&mut self, reply: ReportReply) -> bool {
-        if !self.is_opening {
-            self.is_opening = true;
+        if !self.has_begun_to_open {
+            self.has_begun_to_open = true;
             self.open(reply.store);
         }
         self.exchange.learn(&reply.peers);

@@ -140,7 +140,7 @@ fn describe(run: &RunId, status: &RunStatus) -> Outcome {
     for (count, what) in [
         (status.late_results, "results came too late and were refused"),
         (status.divergent_results, "of them differed from the published ones"),
-        (status.refused_callers, "callers were refused (no token, a wrong one, or no TLS)"),
+        (status.refused_callers, "callers were refused (no token, a wrong one, or no TLS handshake)"),
     ] {
         if count > 0 {
             text.push_str(&format!("{count} {what}\n"));

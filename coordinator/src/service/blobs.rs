@@ -76,6 +76,11 @@ impl Blobs for BlobService {
         while let Some(chunk) = chunks.next().await {
             let wire::WriteChunk { blob, data } = chunk?;
             if let Some(wire::Blob { key, length }) = blob {
+                if upload.is_some() {
+                    return Err(
+                        ServiceError::new(Code::Invalid, "only the first chunk names the blob").into()
+                    );
+                }
                 let key = blob_key(&key)?;
                 if length > MAX_BLOB_BYTES {
                     let text = format!("blob {key} of {length} bytes is over the limit of {MAX_BLOB_BYTES}");
