@@ -48,6 +48,7 @@ pub(crate) fn pair_of_rows(
     scratch: &mut VolumeScratch,
 ) {
     let shape = input[0].shape();
+    assert!(!rows.is_empty() && 2 * pair < shape.columns);
     let columns = (shape.columns - 2 * pair).min(2);
     let column = Shape { channels: layer.outputs, ..shape }.column();
     assert!(input.iter().all(|slab| slab.shape() == shape) && shape.channels == layer.inputs);
