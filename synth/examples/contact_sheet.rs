@@ -59,6 +59,9 @@ fn depth_color(sample: &TrainingSample, x: usize, y: usize) -> [u8; 3] {
     if depth <= 0.0 {
         return [0, 0, 120];
     }
+    if depth.is_infinite() {
+        return [0, 110, 160];
+    }
     let range = &sample.range;
     let share = (1.0 / depth - 1.0 / range.max) / (1.0 / range.min - 1.0 / range.max);
     [(share.clamp(0.0, 1.0) * 230.0 + 25.0) as u8; 3]

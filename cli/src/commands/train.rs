@@ -126,13 +126,18 @@ fn describe(step: u64, validation: &Validation) -> Vec<String> {
         let kept = group.confident.pixels as f64 / group.all.pixels.max(1) as f64;
         format!(
             "step {step}, {}: error {:.3} intervals, {:.1} % below 1, {:.1} % below 3; \
-             {:.1} % confident, of these {:.1} % below 1",
+             {:.1} % confident, of these {:.1} % below 1{}",
             group.name,
             group.all.mean(),
             100.0 * one,
             100.0 * three,
             100.0 * kept,
             100.0 * sure_one,
+            if group.absent > 0 {
+                format!("; {:.1} % of pixels without a surface confident", 100.0 * group.absent_share())
+            } else {
+                String::new()
+            },
         )
     };
     validation.groups.iter().map(line).collect()

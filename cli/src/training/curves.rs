@@ -13,7 +13,8 @@ use planesweep_scene::write_atomically;
 const STEPS: &str = "curve.csv";
 const STEPS_HEADING: &str = "step,loss,error,below_1,below_3,gradient_norm,learning_rate,seconds_per_step";
 const VALIDATIONS: &str = "validation.csv";
-const VALIDATIONS_HEADING: &str = "step,group,error,below_1,below_3,confident,confident_below_1";
+const VALIDATIONS_HEADING: &str =
+    "step,group,error,below_1,below_3,confident,confident_below_1,absent_confident";
 
 /// Everything that is written about a run, in its folder.
 pub struct Curves {
@@ -127,12 +128,21 @@ impl Curves {
             let [one, three] = group.all.shares();
             let [sure_one, _] = group.confident.shares();
             let sure = group.confident.pixels as f64 / group.all.pixels.max(1) as f64;
+            let absent = group.absent_share();
             let name = group.name.replace([' ', ',', '/'], "_");
-            self.validations
-                .push(format!("{step},{name},{error:.6},{one:.6},{three:.6},{sure:.6},{sure_one:.6}"));
-            let tags = ["error_intervals", "below_1", "below_3", "confident", "confident_below_1"];
+            self.validations.push(format!(
+                "{step},{name},{error:.6},{one:.6},{three:.6},{sure:.6},{sure_one:.6},{absent:.6}"
+            ));
+            let tags = [
+                "error_intervals",
+                "below_1",
+                "below_3",
+                "confident",
+                "confident_below_1",
+                "absent_confident",
+            ];
             let tags = tags.map(|tag| format!("{name}/{tag}"));
-            let values = [error, one, three, sure, sure_one];
+            let values = [error, one, three, sure, sure_one, absent];
             let scalars: Vec<_> = tags.iter().map(String::as_str).zip(values).collect();
             self.write_event(step, &scalars)?;
         }

@@ -96,6 +96,9 @@ pub struct LossConfig {
     pub refined_weight: f64,
     /// Errors beyond this many intervals count as this many and teach nothing.
     pub clamp: Option<f64>,
+    /// The weight of pixels whose surface surely lies at no hypothesis, such as the sky's: there the probabilities are
+    /// drawn towards equal ones, by their divergence, so that confidence is low. The mean is over all pixels.
+    pub absent_weight: f64,
 }
 
 /// Adam (Kingma and Ba 2015) with gradient clipping and a schedule.
@@ -238,7 +241,7 @@ impl Default for SampleConfig {
 
 impl Default for LossConfig {
     fn default() -> Self {
-        Self { refined_weight: 1.0, clamp: Some(30.0) }
+        Self { refined_weight: 1.0, clamp: Some(30.0), absent_weight: 0.0 }
     }
 }
 
@@ -295,7 +298,7 @@ impl TrainConfig {
     pub fn checked(self) -> Result<Self, ConfigError> {
         let SampleConfig { sizes, views, depths, spacing_px, inverse_share, range_jitter, photometric } =
             &self.samples;
-        let LossConfig { refined_weight, clamp } = self.loss;
+        let LossConfig { refined_weight, clamp, absent_weight } = self.loss;
         let o = &self.optimizer;
         let share = |value: f64| (0.0..=1.0).contains(&value);
         let positive = |value: f64| value > 0.0 && value.is_finite();
@@ -337,6 +340,11 @@ impl TrainConfig {
                 "0 or a positive number",
             ),
             (clamp.is_none_or(positive), "loss.clamp", "a positive number"),
+            (
+                absent_weight >= 0.0 && absent_weight.is_finite(),
+                "loss.absent_weight",
+                "0 or a positive number",
+            ),
             (positive(o.learning_rate), "optimizer.learning_rate", "a positive number"),
             (o.final_share > 0.0 && share(o.final_share), "optimizer.final_share", "above 0 and at most 1"),
             (share(o.beta1) && o.beta1 < 1.0, "optimizer.beta1", "at least 0 and below 1"),

@@ -62,9 +62,9 @@ pub struct IntervalErrors {
 }
 
 impl IntervalErrors {
-    /// Errors of fractional indices, where the truth is a number.
+    /// Errors of fractional indices, where the truth is finite.
     pub fn of(indices: impl IntoIterator<Item = f32>, truth: &[f32]) -> Self {
-        let pairs = indices.into_iter().zip(truth).filter(|(_, truth)| !truth.is_nan());
+        let pairs = indices.into_iter().zip(truth).filter(|(_, truth)| truth.is_finite());
         pairs.fold(Self::default(), |mut errors, (index, truth)| {
             let error = f64::from((index - truth).abs());
             errors.pixels += 1;

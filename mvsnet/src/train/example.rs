@@ -10,6 +10,9 @@ use crate::backend::quarter_camera;
 use crate::confidence::spacing_px;
 use crate::input::InputImage;
 
+/// A surface this many steps outside of the hypotheses looks like none of them.
+const ABSENT_FROM: f64 = 2.0;
+
 /// Images, hypotheses and true depths of one reference view.
 #[derive(Clone, Debug)]
 pub struct Example {
@@ -18,8 +21,8 @@ pub struct Example {
     /// `K [R | t]` of their feature maps.
     pub(crate) projections: Vec<Matrix3x4<f64>>,
     pub(crate) hypotheses: DepthHypotheses,
-    /// The fractional index of the true depth among the hypotheses, of the size of the features; NaN
-    /// where it is unknown or outside the hypotheses.
+    /// The fractional index of the true depth among the hypotheses, of the size of the features; NaN where it is
+    /// unknown, infinite where no hypothesis is right.
     pub(crate) truth: Raster<f32>,
     /// Spacing of the hypotheses in the middle of the reference, in pixels of the best source view.
     pub(crate) spacing_px: f64,
@@ -160,10 +163,20 @@ impl Example {
         let last = f64::from(hypotheses.count() - 1);
         let truth = Raster::from_fn(images[0].width / 4, images[0].height / 4, |x, y| {
             let depth = f64::from(depth.get(x, y).unwrap_or(0.0));
-            let index = if depth > 0.0 { hypotheses.index_of(depth) } else { f64::NAN };
-            if (0.0..=last).contains(&index) { index as f32 } else { f32::NAN }
+            let index = match depth {
+                f64::INFINITY => depth,
+                _ if depth > 0.0 => hypotheses.index_of(depth),
+                _ => f64::NAN,
+            };
+            if (0.0..=last).contains(&index) {
+                index as f32
+            } else if (-ABSENT_FROM..=last + ABSENT_FROM).contains(&index) || index.is_nan() {
+                f32::NAN
+            } else {
+                f32::INFINITY
+            }
         });
-        if truth.values().iter().all(|index| index.is_nan()) {
+        if !truth.values().iter().any(|index| index.is_finite()) {
             return Err(ExampleError::NoTruth);
         }
         let spacing_px = spacing_px(&views[0].camera, &views[1].camera, &hypotheses);
@@ -172,7 +185,7 @@ impl Example {
 
     /// Pixels whose true depth is known and within the hypotheses.
     pub fn valid_pixels(&self) -> usize {
-        self.truth.values().iter().filter(|index| !index.is_nan()).count()
+        self.truth.values().iter().filter(|index| index.is_finite()).count()
     }
 }
 

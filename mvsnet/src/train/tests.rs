@@ -34,21 +34,40 @@ const ALL_NETWORKS: [NetworkConfig; 4] = [
     },
 ];
 
-/// A smooth surface before three cameras, unknown in one corner.
+/// A smooth surface before three cameras, unknown in one corner and absent in two.
 fn example(network: NetworkConfig, depths: u32) -> Example {
     let images = Images::new(96, 64, Sampling::Uniform);
     let mut views = vec![images.reference, images.sources[0].clone(), images.sources[1].clone()];
     views[2].pixels = views[2].pixels.cropped(96, 64);
     let depth = Raster::from_fn(24, 16, |x, y| {
-        if x + y < 6 { 0.0 } else { 3.0 + 0.15 * x as f32 + 0.1 * y as f32 + f32::from(x > 14) }
+        if x + y < 6 {
+            0.0
+        } else if x + y > 34 {
+            f32::INFINITY
+        } else if x < 3 {
+            0.5
+        } else {
+            3.0 + 0.15 * x as f32 + 0.1 * y as f32 + f32::from(x > 14)
+        }
     });
     let sample = TrainingSample { views, depth, range: DepthRange { min: 2.0, max: 8.0, count: None } };
     let hypotheses = DepthHypotheses::new(Sampling::Inverse, 2.0, 9.0, depths).expect("a valid range");
     Example::new(&sample, hypotheses, network).expect("a fine example")
 }
 
+#[test]
+fn surfaces_at_no_hypothesis_are_told_from_unknown_ones() {
+    let example = example(ALL_NETWORKS[0], 16);
+    let truth = &example.truth;
+    assert!(truth.at(0, 0).is_nan(), "unknown");
+    assert!(truth.at(23, 15).is_infinite(), "the sky");
+    assert!(truth.at(0, 10).is_infinite(), "far before the first hypothesis");
+    let index = example.hypotheses.index_of(3.0 + 0.15 * 10.0 + 0.1 * 5.0);
+    assert!((f64::from(truth.at(10, 5)) - index).abs() < 1e-5);
+}
+
 fn options(network: NetworkConfig, statistics: BatchStatistics) -> GradientOptions {
-    let loss = LossConfig { refined_weight: 0.7, clamp: Some(6.0) };
+    let loss = LossConfig { refined_weight: 0.7, clamp: Some(6.0), absent_weight: 0.8 };
     GradientOptions { network, loss, statistics }
 }
 

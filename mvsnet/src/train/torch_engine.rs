@@ -85,14 +85,19 @@ impl TorchEngine {
             self.upload(&image.planes, &size)
         });
         let images: Vec<Tensor> = images.collect::<Result<_, _>>().map_err(doing("uploading images"))?;
-        let index = network.index(&images, example, options).map_err(doing("regressing depth"))?;
+        let (probability, index) =
+            network.index(&images, example, options).map_err(doing("regressing depth"))?;
         let refined =
             network.refined(&index, &images[0], example, options).map_err(doing("refining depth"))?;
         let truth = example.truth.values();
         let truth = self.upload(truth, &[example.truth.height() as i64, example.truth.width() as i64]);
         let truth = truth.map_err(doing("uploading depth"))?;
         let total = || {
-            let initial = loss(&index, &truth, &options.loss)?;
+            let mut initial = loss(&index, &truth, &options.loss)?;
+            if options.loss.absent_weight > 0.0 {
+                let absent = absent_loss(&probability, &truth)?.f_mul_scalar(options.loss.absent_weight)?;
+                initial = initial.f_add(&absent)?;
+            }
             match &refined {
                 Some(refined) => initial
                     .f_add(&loss(refined, &truth, &options.loss)?.f_mul_scalar(options.loss.refined_weight)?),
@@ -123,12 +128,21 @@ impl TorchEngine {
 
 /// Mean absolute error over pixels with a truth, in intervals.
 fn loss(index: &Tensor, truth: &Tensor, config: &LossConfig) -> Result<Tensor, TchError> {
-    let valid = truth.f_isnan()?.f_logical_not()?;
+    let valid = truth.f_isfinite()?;
     let error = index.f_sub(truth)?.f_masked_select(&valid)?.f_abs()?;
     match config.clamp {
         Some(limit) => error.f_clamp_max(limit)?.f_mean(error.kind()),
         None => error.f_mean(error.kind()),
     }
+}
+
+/// The divergence of the probabilities from equal ones at pixels whose truth is at no hypothesis, over all pixels.
+fn absent_loss(probability: &Tensor, truth: &Tensor) -> Result<Tensor, TchError> {
+    let logarithms = probability.f_clamp_min(f64::from(f32::MIN_POSITIVE))?.f_log()?;
+    let equal = (probability.size()[0] as f64).ln();
+    let divergence = logarithms.f_mean_dim(0, false, logarithms.kind())?.f_neg()?.f_sub_scalar(equal)?;
+    let absent = divergence.f_masked_fill(&truth.f_isinf()?.f_logical_not()?, 0.0)?;
+    absent.f_mean(absent.kind())
 }
 
 /// The network with batch normalisation that can be differentiated.
@@ -154,18 +168,20 @@ impl TrainedNetwork {
         Ok(Self { tensors, statistics, measured: BTreeMap::new() })
     }
 
-    /// The expected index of the hypothesis at each pixel.
+    /// The probabilities of the hypotheses, and their expected index, at each pixel.
     fn index(
         &mut self,
         images: &[Tensor],
         example: &Example,
         options: &GradientOptions,
-    ) -> Result<Tensor, TchError> {
+    ) -> Result<(Tensor, Tensor), TchError> {
         // One batch for batch normalisation, when the sizes agree; sources of other sizes make others.
         let features = self.features(&Tensor::f_cat(images, 0)?, options.network.features)?;
         let volume = cost_volume(&features, example, options.network.metric)?;
         let logits = self.regularized(&volume)?;
-        depth::expected_index(&depth::probability(&logits)?)
+        let probability = depth::probability(&logits)?;
+        let index = depth::expected_index(&probability)?;
+        Ok((probability, index))
     }
 
     fn features(&mut self, images: &Tensor, network: FeatureNetwork) -> Result<Tensor, TchError> {

@@ -30,7 +30,7 @@ pub enum ValidationError {
 struct Case {
     views: Vec<WorkingImage>,
     hypotheses: DepthHypotheses,
-    /// Fractional indices of the true depths; NaN where unknown.
+    /// Fractional indices of the true depths; NaN where unknown, infinite at no hypothesis.
     truth: Raster<f32>,
 }
 
@@ -57,6 +57,17 @@ pub struct GroupErrors {
     pub all: IntervalErrors,
     /// The errors of pixels whose confidence is above 0.8.
     pub confident: IntervalErrors,
+    /// Pixels whose surface is at no hypothesis.
+    pub absent: u64,
+    /// How many of these have a confidence above 0.8 all the same.
+    pub absent_confident: u64,
+}
+
+impl GroupErrors {
+    /// The share of pixels without a surface at any hypothesis that have a confidence above 0.8.
+    pub fn absent_share(&self) -> f64 {
+        self.absent_confident as f64 / self.absent.max(1) as f64
+    }
 }
 
 /// The errors of weights, group by group.
@@ -110,21 +121,31 @@ impl ValidationSet {
     pub fn measure(&self, weights: &Weights, threads: usize) -> Result<Validation, ValidationError> {
         let mut backend = CpuBackend::new(weights, threads, None)?;
         let group = |group: &Group| {
-            let (mut all, mut confident) = (IntervalErrors::default(), IntervalErrors::default());
+            let mut errors = GroupErrors {
+                name: group.name.clone(),
+                all: IntervalErrors::default(),
+                confident: IntervalErrors::default(),
+                absent: 0,
+                absent_confident: 0,
+            };
             for Case { views, hypotheses, truth } in &group.cases {
                 let sources: Vec<&WorkingImage> = views[1..].iter().collect();
                 let map =
                     backend.infer(InferInput { reference: &views[0], sources: &sources, hypotheses })?;
                 let truth = truth.cropped(map.width(), map.height());
                 let index = |depth: &f32| hypotheses.index_of(f64::from(*depth)) as f32;
-                all = all.plus(IntervalErrors::of(map.depth.values().iter().map(index), truth.values()));
-                let pairs = truth.values().iter().zip(map.confidence.values());
+                errors.all =
+                    errors.all.plus(IntervalErrors::of(map.depth.values().iter().map(index), truth.values()));
+                let pairs = || truth.values().iter().zip(map.confidence.values());
                 let trusted: Vec<f32> =
-                    pairs.map(|(truth, sure)| if *sure > 0.8 { *truth } else { f32::NAN }).collect();
-                confident =
-                    confident.plus(IntervalErrors::of(map.depth.values().iter().map(index), &trusted));
+                    pairs().map(|(truth, sure)| if *sure > 0.8 { *truth } else { f32::NAN }).collect();
+                let trusted = IntervalErrors::of(map.depth.values().iter().map(index), &trusted);
+                errors.confident = errors.confident.plus(trusted);
+                errors.absent += pairs().filter(|(truth, _)| truth.is_infinite()).count() as u64;
+                errors.absent_confident +=
+                    pairs().filter(|(truth, sure)| truth.is_infinite() && **sure > 0.8).count() as u64;
             }
-            Ok(GroupErrors { name: group.name.clone(), all, confident })
+            Ok(errors)
         };
         let groups = self.groups.iter().map(group).collect::<Result<_, ValidationError>>()?;
         Ok(Validation { groups })

@@ -22,7 +22,8 @@ pub fn write_training_sample(out: &Path, sample: &TrainingSample) -> Result<(), 
     let count = sample.views.len();
     let score = |i: usize| SourceScore { view: ViewId(i as u32), score: (count - i) as f64 };
     scene.pairs.insert(ViewId(0), (1..count).map(score).collect());
-    folder.write_depth(ViewId(0), &sample.depth)?;
+    // Such folders tell sky and unseen surfaces by nothing.
+    folder.write_depth(ViewId(0), &sample.depth.map(|d| if d.is_finite() { *d } else { 0.0 }))?;
     folder.write_cameras(&scene)
 }
 
@@ -46,7 +47,7 @@ mod tests {
         for (i, sample) in samples.iter().enumerate() {
             let read = set.sample(i, &SampleShape { width: 96, height: 64, views: 3 }, 0).expect("read");
             assert_eq!(read.views, sample.views);
-            assert_eq!(read.depth, sample.depth);
+            assert_eq!(read.depth, sample.depth.map(|d| if d.is_finite() { *d } else { 0.0 }));
             assert!((read.range.min / sample.range.min - 1.0).abs() < 1e-9);
             assert!((read.range.max / sample.range.max - 1.0).abs() < 1e-9);
         }

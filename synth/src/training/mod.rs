@@ -78,8 +78,7 @@ pub fn training_sample_with(seed: u64, options: &TrainingOptions, library: &Libr
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(attempt);
         let Some(draft) = Draft::new(options, library, rng) else { continue };
-        let known = draft.depth.values().iter().filter(|d| **d > 0.0).count() as f64
-            / draft.depth.values().len().max(1) as f64;
+        let known = truth::known(&draft.depth).count() as f64 / draft.depth.values().len().max(1) as f64;
         if best.as_ref().is_none_or(|(most, _)| known > *most) {
             best = Some((known, draft));
         }
@@ -205,8 +204,7 @@ mod tests {
             assert_eq!((sample.depth.width(), sample.depth.height()), (24, 16));
             let DepthRange { min, max, .. } = sample.range;
             assert!(min > 0.0 && max > min && max.is_finite(), "{min} to {max}");
-            let known: Vec<f64> =
-                sample.depth.values().iter().filter(|d| **d > 0.0).map(|d| f64::from(*d)).collect();
+            let known: Vec<f64> = truth::known(&sample.depth).collect();
             let inside = known.iter().filter(|d| (min..=max).contains(*d)).count();
             assert!(known.len() > 24 * 16 / 5, "seed {seed}: {} pixels known", known.len());
             assert!(inside * 100 >= known.len() * 94, "seed {seed}: {inside} of {} in range", known.len());
@@ -225,7 +223,7 @@ mod tests {
             let (mut known, mut confirmed, mut before) = (0, 0, 0);
             for (x, y) in (0..depth.height()).flat_map(|y| (0..depth.width()).map(move |x| (x, y))) {
                 let z = f64::from(depth.at(x, y));
-                if z <= 0.0 {
+                if z <= 0.0 || z.is_infinite() {
                     continue;
                 }
                 known += 1;

@@ -14,7 +14,8 @@ use crate::render::Eye;
 /// As many sparse points as structure from motion finds in an image of this size, about.
 const SPARSE_POINTS: usize = 300;
 
-/// The reference view's depth (z) at a quarter of the size; 0 where no surface is or no source sees it.
+/// The reference view's depth (z) at a quarter of the size; 0 where no source sees the surface, infinite where the sky
+/// is.
 pub fn depth(world: &World, cameras: &[Camera]) -> Raster<f32> {
     let [reference, sources @ ..] = cameras else { return Raster::filled(0, 0, 0.0) };
     let map = Camera { intrinsics: reference.intrinsics.quartered(), pose: reference.pose };
@@ -25,7 +26,10 @@ pub fn depth(world: &World, cameras: &[Camera]) -> Raster<f32> {
     depth.values_mut().par_chunks_mut(width).enumerate().for_each(|(y, row)| {
         for (x, value) in row.iter_mut().enumerate() {
             let ray = eye.ray(&Point2::new(x as f64, y as f64));
-            let Some((t, _)) = world.nearest(&ray) else { continue };
+            let Some((t, _)) = world.nearest(&ray) else {
+                *value = f32::INFINITY;
+                continue;
+            };
             let point = ray.at(t);
             if sources.iter().any(|(camera, eye)| sees(world, camera, eye, &point)) {
                 *value = t as f32;
@@ -35,10 +39,15 @@ pub fn depth(world: &World, cameras: &[Camera]) -> Raster<f32> {
     depth
 }
 
+/// The depths that are known, row by row.
+pub fn known(depth: &Raster<f32>) -> impl Iterator<Item = f64> {
+    depth.values().iter().filter(|d| **d > 0.0 && d.is_finite()).map(|d| f64::from(*d))
+}
+
 /// Percentiles of depths at random pixels with a margin, as a plan takes them from sparse points, but
 /// wider by chance: real points include wrong ones. `None` when too few pixels have depth.
 pub fn range(depth: &Raster<f32>, rng: &mut ChaCha8Rng) -> Option<DepthRange> {
-    let known: Vec<f64> = depth.values().iter().filter(|d| **d > 0.0).map(|d| f64::from(*d)).collect();
+    let known: Vec<f64> = known(depth).collect();
     if known.len() * 10 < depth.values().len() {
         return None;
     }

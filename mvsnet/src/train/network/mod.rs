@@ -96,7 +96,11 @@ fn run(mut step: Step<'_>, example: &Example, options: &GradientOptions) -> Grad
         refined = Some(errors(&indices));
         index_gradient.iter_mut().zip(gradient).for_each(|(to, more)| *to += more);
     }
-    let gradient = regression.gradient(&tools, &index_gradient);
+    let absent = options.loss.absent_weight;
+    if absent > 0.0 {
+        total += absent * regression.absent_loss(&example.truth);
+    }
+    let gradient = regression.gradient(&tools, &index_gradient, &example.truth, absent);
     let mut cost_gradient = CostGradient::new(&tools, &input);
     back_regularized(&mut step, regularization, &gradient, |rows| cost_gradient.take(rows));
     back_features(&mut step, feature_layers, &cost_gradient.features(shape));

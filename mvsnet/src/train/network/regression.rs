@@ -50,9 +50,10 @@ impl Regression {
         Self { probability: Stack::new(slabs), index: index.concat() }
     }
 
-    /// The gradient of the logits from that of the expected indices.
-    pub(super) fn gradient(&self, tools: &Tools, index: &[f64]) -> Stack {
-        let Shape { columns, .. } = self.probability.shape;
+    /// The gradient of the logits from that of the expected indices, and by the loss of pixels at no hypothesis.
+    pub(super) fn gradient(&self, tools: &Tools, index: &[f64], truth: &Raster<f32>, absent: f64) -> Stack {
+        let Shape { columns, length, .. } = self.probability.shape;
+        let (share, equal) = ((absent / index.len() as f64) as f32, 1.0 / length as f32);
         Stack::compute(tools, self.probability.slabs.len(), self.probability.shape, |y, slab| {
             for x in 0..columns {
                 let (expected, g) = (self.index[y * columns + x], index[y * columns + x] as f32);
@@ -60,17 +61,37 @@ impl Regression {
                 for ((to, p), k) in slab.channel_mut(x, 0).iter_mut().zip(probability).zip(0_u32..) {
                     *to = g * p * (f64::from(k) - expected) as f32;
                 }
+                if share > 0.0 && truth.at(x, y).is_infinite() {
+                    let values = slab.channel_mut(x, 0).iter_mut().zip(probability);
+                    values.for_each(|(to, p)| *to += share * (p - equal));
+                }
             }
         })
     }
 }
 
+impl Regression {
+    /// The divergence of the probabilities from equal ones at pixels whose truth is at no hypothesis, over all pixels.
+    pub(super) fn absent_loss(&self, truth: &Raster<f32>) -> f64 {
+        let Shape { columns, length, .. } = self.probability.shape;
+        let pixel = |x: usize, y: usize| {
+            let probability = self.probability.slabs[y].channel(x, 0);
+            let logarithms = probability.iter().map(|p| f64::from(p.max(f32::MIN_POSITIVE)).ln());
+            -logarithms.sum::<f64>() / length as f64 - (length as f64).ln()
+        };
+        let row =
+            |y: usize| (0..columns).filter(|x| truth.at(*x, y).is_infinite()).map(|x| pixel(x, y)).sum();
+        let rows: Vec<f64> = (0..self.probability.slabs.len()).into_par_iter().map(row).collect();
+        rows.iter().sum::<f64>() / self.index.len() as f64
+    }
+}
+
 /// Mean absolute error over pixels with a truth, and its gradient, both times `weight`.
 pub(super) fn loss(index: &[f64], truth: &Raster<f32>, config: LossConfig, weight: f64) -> (f64, Vec<f64>) {
-    let valid = truth.values().iter().filter(|truth| !truth.is_nan()).count().max(1) as f64;
+    let valid = truth.values().iter().filter(|truth| truth.is_finite()).count().max(1) as f64;
     let mut total = 0.0;
     let pixel = |(index, truth): (&f64, &f32)| {
-        if truth.is_nan() {
+        if !truth.is_finite() {
             return 0.0;
         }
         let error = index - f64::from(*truth);
