@@ -14,10 +14,14 @@ use planesweep_scene::{
 };
 
 fn main() {
-    let arguments: Vec<usize> = std::env::args().skip(1).filter_map(|a| a.parse().ok()).collect();
-    let [width, height, depths, views, threads, runs] = match arguments[..] {
-        [a, b, c, d, e, f] => [a, b, c, d, e, f],
-        _ => [320, 256, 64, 3, 2, 5],
+    let arguments: Result<Vec<usize>, _> = std::env::args().skip(1).map(|a| a.parse()).collect();
+    let [width, height, depths, views, threads, runs] = match arguments.as_deref() {
+        Ok([]) => [320, 256, 64, 3, 2, 5],
+        Ok(&[a, b, c, d, e, f]) => [a, b, c, d, e, f],
+        _ => {
+            eprintln!("usage: bench_train [WIDTH HEIGHT DEPTHS VIEWS THREADS RUNS]");
+            std::process::exit(2);
+        }
     };
     let config = TrainConfig::default();
     let example = example(config.network, [width, height], depths as u32, views);

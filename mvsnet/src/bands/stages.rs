@@ -28,10 +28,7 @@ struct StoredRows<'a>(&'a [Row]);
 
 impl ColumnSource for StoredRows<'_> {
     fn columns(&mut self, row: usize, x: usize) -> [Column<'_>; 4] {
-        let row = &self.0[row];
-        // Beyond the last column there is one of zeros.
-        let end = row.shape().columns as isize;
-        [-1, 0, 1, 2].map(|offset| row.column((x as isize + offset).min(end)))
+        self.0[row].four_columns(x)
     }
 }
 

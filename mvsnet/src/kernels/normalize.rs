@@ -13,9 +13,9 @@ pub(crate) type Slopes = [f32; 3];
 /// Sums of `z` and of its square, for each of the first channels.
 pub(crate) fn moments(level: Level, z: Columns<'_>, channels: usize) -> Vec<[f64; 2]> {
     assert!(channels <= z.shape().channels);
-    let mut sums = vec![[0.0; 2]; channels];
-    run_moments(level, &mut Moments { z, sums: &mut sums });
-    sums
+    let mut totals = vec![[0.0; 2]; channels];
+    run_sums(level, &mut Sums { z, gradient: None, totals: &mut totals });
+    totals
 }
 
 /// Sums of the gradient where ReLU lets it through, and of its product with `z`, for each channel.
@@ -29,9 +29,9 @@ pub(crate) fn gradient_sums(
     affine: &[Affine],
 ) -> Vec<[f64; 2]> {
     check(z, output, affine.len());
-    let mut sums = vec![[0.0; 2]; affine.len()];
-    run_sums(level, &mut GradientSums { z, output, affine, totals: &mut sums });
-    sums
+    let mut totals = vec![[0.0; 2]; affine.len()];
+    run_sums(level, &mut Sums { z, gradient: Some((output, affine)), totals: &mut totals });
+    totals
 }
 
 /// Writes the gradient of `z` from that of the output into columns of as many channels as there are slopes.
@@ -84,15 +84,10 @@ struct Apply<'a> {
     to: &'a mut [f32],
 }
 
-struct Moments<'a> {
+/// Sums of `g` and of `g * z`, where `g` is the gradient that ReLU lets through, or `z` itself.
+struct Sums<'a> {
     z: Columns<'a>,
-    sums: &'a mut [[f64; 2]],
-}
-
-struct GradientSums<'a> {
-    z: Columns<'a>,
-    output: Columns<'a>,
-    affine: &'a [Affine],
+    gradient: Option<(Columns<'a>, &'a [Affine])>,
     totals: &'a mut [[f64; 2]],
 }
 
@@ -105,8 +100,7 @@ struct Gradient<'a> {
 }
 
 by_level!(run_apply(task: &mut Apply<'_>) = apply_to[][]);
-by_level!(run_moments(task: &mut Moments<'_>) = moments_of[][]);
-by_level!(run_sums(task: &mut GradientSums<'_>) = sums_of[][]);
+by_level!(run_sums(task: &mut Sums<'_>) = sums_of[][]);
 by_level!(run_gradient(task: &mut Gradient<'_>) = gradient_of[][]);
 
 /// # Safety
@@ -128,7 +122,7 @@ unsafe fn apply_to<S: Simd>(task: &mut Apply<'_>) {
                 }
                 S::store(to.add(begin), v);
             }
-            for beyond in shape.length..shape.length.next_multiple_of(LANES) {
+            for beyond in shape.length..shape.padded() {
                 *to.add(beyond) = 0.0;
             }
         }
@@ -136,43 +130,32 @@ unsafe fn apply_to<S: Simd>(task: &mut Apply<'_>) {
 }
 
 /// # Safety
-/// As [`Simd`]; the sizes are those `moments` checks. Stored values beyond the length are zero and count for nothing.
+/// As [`Simd`]; the sizes are those `moments` and `gradient_sums` check. Stored values beyond the length are zero and
+/// count for nothing.
 #[inline(always)]
-unsafe fn moments_of<S: Simd>(task: &mut Moments<'_>) {
+unsafe fn sums_of<S: Simd>(task: &mut Sums<'_>) {
     let shape = task.z.shape();
-    for (channel, sums) in task.sums.iter_mut().enumerate() {
-        let mut lanes = [S::splat(0.0); 2];
+    for (channel, totals) in task.totals.iter_mut().enumerate() {
+        let mut sums = [S::splat(0.0); 2];
         for x in 0..shape.columns {
             let z = task.z.as_ptr().add(x * shape.column() + channel * shape.stride());
-            for begin in (0..shape.length).step_by(LANES) {
-                let z = S::load(z.add(begin));
-                lanes[0] = S::add(lanes[0], z);
-                lanes[1] = S::mul_add(z, z, lanes[1]);
+            if let Some((output, affine)) = &task.gradient {
+                let [scale, shift] = *affine.get_unchecked(channel);
+                let (scale, shift) = (S::splat(scale), S::splat(shift));
+                let g = output.as_ptr().add(x * output.shape().column() + channel * shape.stride());
+                for begin in (0..shape.length).step_by(LANES) {
+                    let z = S::load(z.add(begin));
+                    let g = S::where_positive(S::mul_add(scale, z, shift), S::load(g.add(begin)));
+                    sums = [S::add(sums[0], g), S::mul_add(g, z, sums[1])];
+                }
+            } else {
+                for begin in (0..shape.length).step_by(LANES) {
+                    let z = S::load(z.add(begin));
+                    sums = [S::add(sums[0], z), S::mul_add(z, z, sums[1])];
+                }
             }
         }
-        *sums = [total::<S>(lanes[0]), total::<S>(lanes[1])];
-    }
-}
-
-/// # Safety
-/// As `moments_of`; the sizes are those `gradient_sums` checks.
-#[inline(always)]
-unsafe fn sums_of<S: Simd>(task: &mut GradientSums<'_>) {
-    let (shape, output) = (task.z.shape(), task.output.shape());
-    for (channel, (sums, [scale, shift])) in task.totals.iter_mut().zip(task.affine).enumerate() {
-        let (scale, shift) = (S::splat(*scale), S::splat(*shift));
-        let mut lanes = [S::splat(0.0); 2];
-        for x in 0..shape.columns {
-            let z = task.z.as_ptr().add(x * shape.column() + channel * shape.stride());
-            let g = task.output.as_ptr().add(x * output.column() + channel * shape.stride());
-            for begin in (0..shape.length).step_by(LANES) {
-                let z = S::load(z.add(begin));
-                let g = S::where_positive(S::mul_add(scale, z, shift), S::load(g.add(begin)));
-                lanes[0] = S::add(lanes[0], g);
-                lanes[1] = S::mul_add(g, z, lanes[1]);
-            }
-        }
-        *sums = [total::<S>(lanes[0]), total::<S>(lanes[1])];
+        *totals = sums.map(|lanes| total::<S>(lanes));
     }
 }
 
@@ -196,7 +179,7 @@ unsafe fn gradient_of<S: Simd>(task: &mut Gradient<'_>) {
                 let g = S::where_positive(S::mul_add(scale, z, shift), S::load(g.add(begin)));
                 S::store(to.add(begin), S::mul_add(a, g, S::mul_add(b, z, c)));
             }
-            for beyond in shape.length..shape.length.next_multiple_of(LANES) {
+            for beyond in shape.length..shape.padded() {
                 *to.add(beyond) = 0.0;
             }
         }
@@ -204,6 +187,9 @@ unsafe fn gradient_of<S: Simd>(task: &mut Gradient<'_>) {
 }
 
 /// The sum of all lanes, in their order.
+///
+/// # Safety
+/// As [`Simd`].
 #[inline(always)]
 unsafe fn total<S: Simd>(lanes: S::V) -> f64 {
     let mut values = [0.0; LANES];

@@ -75,6 +75,28 @@ macro_rules! by_level {
 }
 pub(crate) use by_level;
 
+/// Calls a block over all pairs of vectors of a padded axis: as many at a time as `WIDEST` and what is left allow, where
+/// four are better taken as two and two.
+macro_rules! by_width {
+    ($pairs:expr, $widest:ident, $block:ident::<$simd:ident, $outputs:ident>($task:ident)) => {
+        let (pairs, mut at) = ($pairs, 0);
+        while at < pairs {
+            let left = pairs - at;
+            if $widest >= 3 && (left == 3 || left > 4) {
+                $block::<$simd, $outputs, 3>($task, at);
+                at += 3;
+            } else if $widest >= 2 && left >= 2 {
+                $block::<$simd, $outputs, 2>($task, at);
+                at += 2;
+            } else {
+                $block::<$simd, $outputs, 1>($task, at);
+                at += 1;
+            }
+        }
+    };
+}
+pub(crate) use by_width;
+
 /// Operations on sixteen lanes.
 ///
 /// # Safety

@@ -84,6 +84,12 @@ impl Slab {
         Column { all, at, shape: self.shape }
     }
 
+    /// Columns `x - 1` to `x + 2`; those beyond the last are zero.
+    pub(crate) fn four_columns(&self, x: usize) -> [Column<'_>; 4] {
+        let end = self.shape.columns as isize;
+        [-1, 0, 1, 2].map(|offset| self.column((x as isize + offset).min(end)))
+    }
+
     /// All columns, each of `Shape::column` values with the zeros of a channel before the channel.
     pub(crate) fn columns_mut(&mut self) -> &mut [f32] {
         let column = self.shape.column();

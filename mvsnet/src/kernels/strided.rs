@@ -115,6 +115,9 @@ unsafe fn column<S: Simd, const OUTPUTS: usize, const WIDEST: usize>(task: &Task
 }
 
 /// `VECTORS` vectors of some outputs.
+///
+/// # Safety
+/// As `column`; `begin` is before the end of the output.
 #[inline(always)]
 unsafe fn block<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(
     task: &Task<'_>,
@@ -147,6 +150,9 @@ unsafe fn block<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(
 }
 
 /// Adds one input column.
+///
+/// # Safety
+/// As `block`; `from` is a place in the column's first channel, `weights` the first of its tap's.
 #[inline(always)]
 unsafe fn tap_sums<S: Simd, const OUTPUTS: usize, const VECTORS: usize, const SIZE: usize>(
     task: &Task<'_>,

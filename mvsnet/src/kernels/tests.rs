@@ -115,8 +115,7 @@ proptest! {
             let pairs = 2 * output.shape().column();
             for (pair, target) in output.columns_mut().chunks_mut(pairs).enumerate() {
                 for (tap, row) in input.iter().enumerate() {
-                    let at = |offset: isize| (2 * pair as isize + offset).min(columns as isize);
-                    let from = [-1, 0, 1, 2].map(|offset| row.column(at(offset)));
+                    let from = row.four_columns(2 * pair);
                     let target = Target { columns: &mut *target, tap, first: tap == 0, last: tap + 1 == rows };
                     layer.accumulate(from, &mut [target], &mut scratch);
                 }
@@ -154,6 +153,45 @@ proptest! {
                 output
             };
             check(whole, |x, o, i| twin(first, x, o, i));
+        }
+    }
+
+    #[test]
+    fn rows_of_a_volume_are_the_convolution(
+        length in 1_usize..120, inputs in 1_usize..6, outputs in 1_usize..20, height in 1_usize..9,
+        columns in 1_usize..4, [begin, count] in [0_usize..8, 1_usize..9], seed: u64,
+    ) {
+        let shape = Shape { columns, channels: inputs, length };
+        let input: Vec<_> = (0..height).map(|i| Arc::new(random_slab(shape, seed ^ i as u64))).collect();
+        let weights = random(outputs * inputs * 27, seed ^ 0x77);
+        let kernel = |o, c, tap, x, k| weights[(((o * inputs + c) * 3 + tap) * 3 + x) * 3 + k];
+        let begin = begin % height;
+        let rows = begin..(begin + count).min(height);
+        let all_rows = |level| {
+            let layer = WinogradLayer::new(level, [inputs, outputs, 3], kernel, &[], false);
+            let shape = Shape { channels: layer.outputs, ..shape };
+            let mut output: Vec<_> = rows.clone().map(|_| Slab::zeroed(shape)).collect();
+            let mut scratch = VolumeScratch::new(&layer, input[0].shape());
+            for pair in 0..columns.div_ceil(2) {
+                let columns = |slab| Slab::columns_mut(slab).chunks_mut(2 * shape.column()).nth(pair);
+                let mut columns: Vec<_> = output.iter_mut().filter_map(columns).collect();
+                pair_of_rows(&layer, &input, rows.clone(), pair, &mut columns, &mut scratch);
+            }
+            output
+        };
+        for (row, y) in rows.clone().enumerate() {
+            check(|level| all_rows(level).swap_remove(row), |x, o, i| {
+                if o >= outputs {
+                    return (0.0, 0.0);
+                }
+                let taps = (0..inputs).flat_map(|c| (0..27).map(move |t| (c, t / 9, t / 3 % 3, t % 3)));
+                let (value, magnitude) = sum(taps.filter_map(|(c, tap, column, k)| {
+                    let from = input.get((y + tap).checked_sub(1)?)?;
+                    let (x, i) = ((x + column) as isize - 1, i + k as isize - 1);
+                    Some(kernel(o, c, tap, column, k) * at(from, x, c, i))
+                }));
+                (value, magnitude + 1.0)
+            });
         }
     }
 
@@ -270,49 +308,51 @@ proptest! {
 
     #[test]
     fn normalisation_and_its_gradient_are_the_formulas(
-        columns in 1_usize..4, channels in 1_usize..9, length in 1_usize..70, skip: bool, seed: u64,
+        columns in 1_usize..4, first in 0_usize..2, channels in 1_usize..9, length in 1_usize..70, skip: bool,
+        seed: u64,
     ) {
         // On a grid, so that no rounding decides what ReLU lets through.
         let gridded = |channels, seed| {
-            let mut slab = random_slab(Shape { columns, channels, length }, seed);
-            for (x, channel) in (0..columns).flat_map(|x| (0..channels).map(move |channel| (x, channel))) {
+            let mut slab = random_slab(Shape { columns: first + columns, channels, length }, seed);
+            for (x, channel) in (0..first + columns).flat_map(|x| (0..channels).map(move |channel| (x, channel))) {
                 slab.channel_mut(x, channel).iter_mut().for_each(|value| *value = (64.0 * *value).round() / 64.0);
             }
             slab
         };
         let (z, output) = (gridded(channels, seed), gridded(channels + 1, seed ^ 1));
+        let (shape, part) = (Shape { columns, channels, length }, first..first + columns);
         let affine: Vec<_> = (0..channels).map(|c| [0.5 * c as f32 - 1.25, 0.25 - 0.125 * c as f32]).collect();
         let slopes: Vec<_> = (0..channels).map(|c| [0.5 + c as f32, 0.25 * c as f32, 0.75]).collect();
         let v = |x: usize, c: usize, i: isize| {
-            f64::from(affine[c][0]) * at(&z, x as isize, c, i) + f64::from(affine[c][1])
+            f64::from(affine[c][0]) * at(&z, (first + x) as isize, c, i) + f64::from(affine[c][1])
         };
         let more = skip.then(|| gridded(channels, seed ^ 2));
         let apply = |level| {
-            let mut result = Slab::zeroed(z.shape());
-            let more = more.as_ref().map(|more| more.columns(0..columns));
-            normalize::apply(level, z.columns(0..columns), more, &affine, result.columns_mut());
+            let mut result = Slab::zeroed(shape);
+            let more = more.as_ref().map(|more| more.columns(part.clone()));
+            normalize::apply(level, z.columns(part.clone()), more, &affine, result.columns_mut());
             result
         };
-        check(apply, |x, c, i| (v(x, c, i).max(0.0) + more.as_ref().map_or(0.0, |more| at(more, x as isize, c, i)), 1.0));
-        let passed = |x: usize, c: usize, i: isize| if v(x, c, i) > 0.0 { at(&output, x as isize, c, i) } else { 0.0 };
+        check(apply, |x, c, i| (v(x, c, i).max(0.0) + more.as_ref().map_or(0.0, |more| at(more, (first + x) as isize, c, i)), 1.0));
+        let passed = |x: usize, c: usize, i: isize| if v(x, c, i) > 0.0 { at(&output, (first + x) as isize, c, i) } else { 0.0 };
         let gradient = |level| {
-            let mut result = Slab::zeroed(z.shape());
-            let (z, output) = (z.columns(0..columns), output.columns(0..columns));
+            let mut result = Slab::zeroed(shape);
+            let (z, output) = (z.columns(part.clone()), output.columns(part.clone()));
             normalize::gradient(level, z, output, &affine, &slopes, result.columns_mut());
             result
         };
         check(gradient, |x, c, i| {
             let [a, b, offset] = slopes[c].map(f64::from);
-            (a * passed(x, c, i) + b * at(&z, x as isize, c, i) + offset, 10.0)
+            (a * passed(x, c, i) + b * at(&z, (first + x) as isize, c, i) + offset, 10.0)
         });
         for level in Level::available() {
-            let (all, of_output) = (z.columns(0..columns), output.columns(0..columns));
+            let (all, of_output) = (z.columns(part.clone()), output.columns(part.clone()));
             let sums = normalize::gradient_sums(level, all, of_output, &affine);
             let moments = normalize::moments(level, all, channels);
             for c in 0..channels {
                 let places = || (0..columns).flat_map(|x| (0..length as isize).map(move |i| (x, i)));
                 let total = |term: &dyn Fn(f64, f64) -> f64| {
-                    places().map(|(x, i)| term(passed(x, c, i), at(&z, x as isize, c, i))).sum::<f64>()
+                    places().map(|(x, i)| term(passed(x, c, i), at(&z, (first + x) as isize, c, i))).sum::<f64>()
                 };
                 prop_assert!((sums[c][0] - total(&|g, _| g)).abs() < 1e-4);
                 prop_assert!((sums[c][1] - total(&|g, z| g * z)).abs() < 1e-4);

@@ -8,7 +8,7 @@
 #![allow(unsafe_op_in_unsafe_fn, reason = "the contract of each kernel covers its body as a whole")]
 
 use super::aligned::Aligned;
-use super::simd::{LANES, Level, Simd, by_level};
+use super::simd::{LANES, Level, Simd, by_level, by_width};
 use super::slab::{COLUMN_START, Column, Shape};
 
 /// A layer's weights in the order they are used.
@@ -98,24 +98,13 @@ by_level!(run(task: &Task<'_>) = column[4, 2][2, 1]);
 /// As [`Simd`]; the sizes are those `apply` checks. The padded output is at most twice the padded input.
 #[inline(always)]
 unsafe fn column<S: Simd, const OUTPUTS: usize, const WIDEST: usize>(task: &Task<'_>) {
-    let vectors = task.to.padded() / (2 * LANES);
-    let mut at = 0;
-    while at < vectors {
-        let left = vectors - at;
-        if WIDEST >= 3 && (left == 3 || left > 4) {
-            block::<S, OUTPUTS, 3>(task, at);
-            at += 3;
-        } else if WIDEST >= 2 && left >= 2 {
-            block::<S, OUTPUTS, 2>(task, at);
-            at += 2;
-        } else {
-            block::<S, OUTPUTS, 1>(task, at);
-            at += 1;
-        }
-    }
+    by_width!(task.to.padded() / (2 * LANES), WIDEST, block::<S, OUTPUTS>(task));
 }
 
 /// All outputs of `VECTORS` input vectors from vector `at` on.
+///
+/// # Safety
+/// As `column`; `at + VECTORS` is at most the number of vectors.
 #[inline(always)]
 unsafe fn block<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(task: &Task<'_>, at: usize) {
     let layer = task.layer;
@@ -159,6 +148,9 @@ unsafe fn block<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(task: &Task
 }
 
 /// Adds one input column to even and odd outputs.
+///
+/// # Safety
+/// As `block`; `from` is a place in the column's first channel, `weights` the first of its tap's.
 #[inline(always)]
 unsafe fn tap_sums<S: Simd, const OUTPUTS: usize, const VECTORS: usize, const SIZE: usize>(
     task: &Task<'_>,

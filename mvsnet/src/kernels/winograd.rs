@@ -8,7 +8,7 @@
 #![allow(unsafe_op_in_unsafe_fn, reason = "the contract of each kernel covers its body as a whole")]
 
 use super::aligned::Aligned;
-use super::simd::{LANES, Level, Simd, by_level};
+use super::simd::{LANES, Level, Simd, by_level, by_width};
 use super::slab::{COLUMN_START, Column, Shape};
 
 /// Products for a 2x2 block of outputs.
@@ -140,24 +140,13 @@ by_level!(run(task: &mut Task<'_, '_>) = blocks[8, 3][4, 1]);
 /// As [`Simd`]; the sizes are those `accumulate` checks.
 #[inline(always)]
 unsafe fn blocks<S: Simd, const OUTPUTS: usize, const WIDEST: usize>(task: &mut Task<'_, '_>) {
-    let vectors = task.shape.padded() / (2 * LANES);
-    let mut at = 0;
-    while at < vectors {
-        let left = vectors - at;
-        if WIDEST >= 3 && (left == 3 || left > 4) {
-            block::<S, OUTPUTS, 3>(task, at);
-            at += 3;
-        } else if WIDEST >= 2 && left >= 2 {
-            block::<S, OUTPUTS, 2>(task, at);
-            at += 2;
-        } else {
-            block::<S, OUTPUTS, 1>(task, at);
-            at += 1;
-        }
-    }
+    by_width!(task.shape.padded() / (2 * LANES), WIDEST, block::<S, OUTPUTS>(task));
 }
 
 /// `VECTORS` vectors of pairs from vector `at` on, for all targets and outputs.
+///
+/// # Safety
+/// As `blocks`; `at + VECTORS` is at most the number of vectors.
 #[inline(always)]
 unsafe fn block<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(task: &mut Task<'_, '_>, at: usize) {
     let inputs = task.layer.inputs;
@@ -212,6 +201,9 @@ unsafe fn block<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(task: &mut 
 }
 
 /// `B^T d B` of 16 blocks of 4x4 inputs, one per lane; product `4 * column + k` goes to `product * step`.
+///
+/// # Safety
+/// As [`Simd`]; 33 values from each of `from` on, and the one before, may be read, and those products written.
 #[inline(always)]
 pub(super) unsafe fn transform<S: Simd>(from: [*const f32; 4], to: *mut f32, step: usize) {
     let t0 = along::<S>(from[0]);
@@ -255,6 +247,9 @@ unsafe fn multiply<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(
 }
 
 /// Adds one product of all inputs.
+///
+/// # Safety
+/// As [`Simd`]; there are `inputs` times `VECTORS` vectors at `from`, and `inputs * OUTPUTS` weights.
 #[inline(always)]
 pub(super) unsafe fn sums<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(
     mut from: *const f32,
@@ -280,6 +275,9 @@ pub(super) unsafe fn sums<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(
 }
 
 /// `A^T m A` of 16 blocks: 32 values of each of two columns.
+///
+/// # Safety
+/// As [`Simd`]; all products lie `step` apart from `from` on.
 #[inline(always)]
 pub(super) unsafe fn inverse<S: Simd>(from: *const f32, step: usize) -> [(S::V, S::V); 2] {
     let mut left = [S::splat(0.0); 4];
@@ -303,8 +301,16 @@ unsafe fn inverse_along<S: Simd>(m: [S::V; 4]) -> (S::V, S::V) {
 }
 
 /// Adds 32 values to those that are there, or to `start`.
+///
+/// # Safety
+/// As [`Simd`]; 32 values at `to` may be written, and read if there is no `start`.
 #[inline(always)]
-unsafe fn add<S: Simd>((mut low, mut high): (S::V, S::V), to: *mut f32, start: Option<S::V>, relu: bool) {
+pub(super) unsafe fn add<S: Simd>(
+    (mut low, mut high): (S::V, S::V),
+    to: *mut f32,
+    start: Option<S::V>,
+    relu: bool,
+) {
     if let Some(start) = start {
         (low, high) = (S::add(low, start), S::add(high, start));
     } else {

@@ -12,7 +12,7 @@ use std::sync::Arc;
 use super::aligned::Aligned;
 use super::cost::transposed;
 use super::simd::{LANES, Level, Simd, by_level};
-use super::slab::{Column, Slab};
+use super::slab::Slab;
 use super::winograd::{PRODUCTS, transform};
 
 /// Vectors of blocks that are transformed at a time.
@@ -130,19 +130,17 @@ unsafe fn all<S: Simd, const OUTPUTS: usize>(task: &mut Task<'_>) {
     }
 }
 
-/// A column near a pair of columns; those beyond the last are zero.
-fn column(slab: &Slab, pair: usize, offset: isize) -> Column<'_> {
-    slab.column((2 * pair as isize + offset).min(slab.shape().columns as isize))
-}
-
 /// `B^T d B` of blocks of 4x4 inputs, with channels innermost.
+///
+/// # Safety
+/// As `all`; the vectors are some of the slab's, at most `VECTORS`.
 #[inline(always)]
 unsafe fn transform_input<S: Simd>(task: &mut Task<'_>, slab: usize, vectors: Range<usize>) {
     let slab = &task.products.input[slab];
     let shape = slab.shape();
     let per_pair = shape.padded() / (2 * LANES);
     for (i, at) in vectors.enumerate() {
-        let columns = [-1, 0, 1, 2].map(|offset| column(slab, at / per_pair, offset));
+        let columns = slab.four_columns(at / per_pair * 2);
         let begin = at % per_pair * 2 * LANES;
         for first in (0..shape.channels).step_by(LANES) {
             let near = task.near.as_mut_ptr();
@@ -167,6 +165,9 @@ unsafe fn transform_input<S: Simd>(task: &mut Task<'_>, slab: usize, vectors: Ra
 }
 
 /// `A g A^T` of blocks of 2x2 gradients, into one of three rows; zero of no slab.
+///
+/// # Safety
+/// As `transform_input`.
 #[inline(always)]
 unsafe fn transform_gradient<S: Simd>(
     task: &mut Task<'_>,
@@ -180,10 +181,10 @@ unsafe fn transform_gradient<S: Simd>(
     let Some(slab) = slab.map(|slab| &task.products.gradient[slab]) else { return row.fill(0.0) };
     let per_pair = shape.padded() / (2 * LANES);
     for (i, at) in vectors.enumerate() {
-        let columns = [0, 1].map(|offset| column(slab, at / per_pair, offset));
+        let [_, left, right, _] = slab.four_columns(at / per_pair * 2);
         let begin = at % per_pair * 2 * LANES;
         for output in 0..shape.channels {
-            let from = columns.map(|column| column.as_ptr().add(output * shape.stride() + begin));
+            let from = [left, right].map(|column| column.as_ptr().add(output * shape.stride() + begin));
             let left = gradient_along::<S>(from[0]);
             let right = gradient_along::<S>(from[1]);
             let to = row.as_mut_ptr().add(output * BLOCKS + i * LANES);
@@ -199,6 +200,9 @@ unsafe fn transform_gradient<S: Simd>(
 }
 
 /// The transform along the contiguous axis, of gradients `2j` and `2j + 1` for each lane `j`.
+///
+/// # Safety
+/// As [`Simd`]; 32 values may be read.
 #[inline(always)]
 unsafe fn gradient_along<S: Simd>(from: *const f32) -> [S::V; 4] {
     let (low, high) = (S::load(from), S::load(from.add(LANES)));
@@ -207,6 +211,9 @@ unsafe fn gradient_along<S: Simd>(from: *const f32) -> [S::V; 4] {
 }
 
 /// Adds the products of all inputs and outputs, with the rows of the kernel in these rows of the gradients.
+///
+/// # Safety
+/// As `all`; this many blocks are transformed.
 #[inline(always)]
 unsafe fn multiply_all<S: Simd, const OUTPUTS: usize>(task: &mut Task<'_>, rows: [usize; 3], blocks: usize) {
     let inputs = task.products.input[0].shape().channels;
@@ -235,6 +242,9 @@ unsafe fn multiply_all<S: Simd, const OUTPUTS: usize>(task: &mut Task<'_>, rows:
 }
 
 /// Adds the products of some vectors of inputs and of some outputs.
+///
+/// # Safety
+/// As `multiply_all`; `x`, `g` and `to` begin at those inputs and outputs.
 #[inline(always)]
 unsafe fn multiply<S: Simd, const OUTPUTS: usize, const INPUTS: usize>(
     x: *const f32,

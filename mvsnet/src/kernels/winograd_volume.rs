@@ -9,9 +9,9 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use super::aligned::Aligned;
-use super::simd::{LANES, Simd, by_level};
+use super::simd::{LANES, Simd, by_level, by_width};
 use super::slab::{COLUMN_START, Shape, Slab};
-use super::winograd::{PRODUCTS, WinogradLayer, inverse, sums, transform};
+use super::winograd::{PRODUCTS, WinogradLayer, add, inverse, sums, transform};
 
 /// Rows of the kernel, and transformed rows that are kept.
 const ROWS: usize = 3;
@@ -75,24 +75,13 @@ by_level!(run(task: &mut Task<'_, '_>) = blocks[8, 3][4, 1]);
 /// As [`Simd`]; the sizes are those `pair_of_rows` checks.
 #[inline(always)]
 unsafe fn blocks<S: Simd, const OUTPUTS: usize, const WIDEST: usize>(task: &mut Task<'_, '_>) {
-    let vectors = task.shape.padded() / (2 * LANES);
-    let mut at = 0;
-    while at < vectors {
-        let left = vectors - at;
-        if WIDEST >= 3 && (left == 3 || left > 4) {
-            block::<S, OUTPUTS, 3>(task, at);
-            at += 3;
-        } else if WIDEST >= 2 && left >= 2 {
-            block::<S, OUTPUTS, 2>(task, at);
-            at += 2;
-        } else {
-            block::<S, OUTPUTS, 1>(task, at);
-            at += 1;
-        }
-    }
+    by_width!(task.shape.padded() / (2 * LANES), WIDEST, block::<S, OUTPUTS>(task));
 }
 
 /// `VECTORS` vectors of pairs from vector `at` on, of all rows.
+///
+/// # Safety
+/// As `blocks`; `at + VECTORS` is at most the number of vectors.
 #[inline(always)]
 unsafe fn block<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(task: &mut Task<'_, '_>, at: usize) {
     let layer = task.layer;
@@ -135,14 +124,9 @@ unsafe fn block<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(task: &mut 
                     let from = products.add((o * VECTORS + v) * LANES);
                     let outputs = inverse::<S>(from, OUTPUTS * VECTORS * LANES);
                     let begin = (at + v) * 2 * LANES;
-                    for (i, (low, high)) in outputs.into_iter().enumerate().take(task.columns) {
+                    for (i, output) in outputs.into_iter().enumerate().take(task.columns) {
                         let to = to.add(i * layer.outputs * task.shape.stride() + begin);
-                        let (mut low, mut high) = (S::add(low, bias), S::add(high, bias));
-                        if layer.relu {
-                            (low, high) = (S::max(low, S::splat(0.0)), S::max(high, S::splat(0.0)));
-                        }
-                        S::store(to, low);
-                        S::store(to.add(LANES), high);
+                        add::<S>(output, to, Some(bias), layer.relu);
                         for beyond in task.shape.length.max(begin)..begin + 2 * LANES {
                             *to.add(beyond - begin) = 0.0;
                         }
@@ -154,6 +138,9 @@ unsafe fn block<S: Simd, const OUTPUTS: usize, const VECTORS: usize>(task: &mut 
 }
 
 /// Transforms one row of the input.
+///
+/// # Safety
+/// As `block`; the input has the row, and there is room for its values at `to`.
 #[inline(always)]
 unsafe fn transform_row<S: Simd, const VECTORS: usize>(
     task: &Task<'_, '_>,
@@ -162,10 +149,7 @@ unsafe fn transform_row<S: Simd, const VECTORS: usize>(
     to: *mut f32,
 ) {
     let slab = task.input.get_unchecked(row);
-    let end = task.shape.columns as isize;
-    // Beyond the last column there is one of zeros.
-    let columns =
-        [-1, 0, 1, 2].map(|offset| slab.column((2 * task.pair as isize + offset).min(end)).as_ptr());
+    let columns = slab.four_columns(2 * task.pair).map(|column| column.as_ptr());
     let inputs = task.layer.inputs;
     for input in 0..inputs {
         for v in 0..VECTORS {

@@ -260,9 +260,7 @@ fn same(tools: &Tools, layer: &WinogradLayer, input: &Stack, volume: bool) -> St
         pairs.with_min_len(2).for_each_init(
             || layer.scratch(),
             |scratch, (pair, columns)| {
-                let y = 2 * pair as isize;
-                let end = input.shape().columns as isize;
-                let input = [y - 1, y, y + 1, y + 2].map(|y| input.column(y.min(end)));
+                let input = input.four_columns(2 * pair);
                 layer.accumulate(input, &mut [Target { columns, tap: 0, first: true, last: true }], scratch);
             },
         );

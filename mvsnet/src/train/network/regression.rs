@@ -29,10 +29,7 @@ impl Regression {
             for x in (0..shape.columns).step_by(2) {
                 let rows = (0..3).filter_map(|tap| {
                     let slab = input.slabs.get((y + tap).checked_sub(1)?)?;
-                    // Beyond the last column there is one of zeros.
-                    let column =
-                        |offset: isize| slab.column((x as isize + offset).min(shape.columns as isize));
-                    Some(([-1, 0, 1, 2].map(column), tap))
+                    Some((slab.four_columns(x), tap))
                 });
                 let pixels = layer.apply(&rows.collect::<Vec<_>>(), 1, &mut scratch);
                 for (pixel, regressed) in pixels.iter().enumerate().take(shape.columns - x) {
