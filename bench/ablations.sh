@@ -67,13 +67,9 @@ else
     train unit-range 'loss.absent_weight = 1.0' 'network.normalization = "unit-range"'
     train two-views 'loss.absent_weight = 1.0' 'samples.views = [2]'
     train five-views 'loss.absent_weight = 1.0' 'samples.views = [5]'
-    train mixed-views 'loss.absent_weight = 1.0' 'samples.views = [3, 3, 5]'
     train sky-teaches-nothing
-    train sky-weighs-more 'loss.absent_weight = 3.0'
     train clamp-5 'loss.absent_weight = 1.0' 'loss.clamp = 5.0'
-    train clamp-none 'loss.absent_weight = 1.0' 'loss.clamp = 1e9'
     train refined-quarter 'loss.absent_weight = 1.0' 'network.refinement = "paper"' 'loss.refined_weight = 0.25'
-    train refined-once 'loss.absent_weight = 1.0' 'network.refinement = "paper"'
 fi
 
 echo "| network | sampling | views | median error | below 1 interval | below 3 intervals | sky above confidence 0.8 |"
@@ -89,11 +85,10 @@ else
         measure "$name" uniform 3
         measure "$name" inverse 3
     done
-    for name in unit-range two-views five-views mixed-views sky-teaches-nothing sky-weighs-more \
-        clamp-5 clamp-none refined-quarter refined-once; do
+    for name in unit-range two-views five-views sky-teaches-nothing clamp-5 refined-quarter; do
         measure "$name" inverse 3
     done
-    for name in chosen five-views mixed-views; do
+    for name in chosen five-views; do
         measure "$name" inverse 5
     done
 fi

@@ -1,218 +1,13 @@
-//! A pickle interpreter that can build numbers, strings, lists, dictionaries and descriptions of
-//! tensors, and nothing else.
-//!
-//! Python's own reader imports and calls whatever a pickle names. This one knows the few names that
-//! PyTorch writes into checkpoints and refuses every other by name, so no file can run code. Containers live in
-//! flat arenas, so no nesting depth can exhaust the stack when they are dropped.
+//! The instructions that pickles of weights are made of.
 
 use std::collections::{BTreeMap, HashMap};
 use std::rc::Rc;
 
-use thiserror::Error;
+use super::value::{Arena, Global, Storage, TensorRef, Value};
+use super::{Pickle, PickleError};
 
-/// Far more than any checkpoint of this network needs (the reference's has 9000 with its optimiser).
-const MAX_INSTRUCTIONS: usize = 2_000_000;
-
-/// Why a pickle is refused. Offsets are in bytes from the start of the pickle.
-#[derive(Debug, Error, PartialEq, Eq)]
-pub enum PickleError {
-    /// The bytes end within an instruction.
-    #[error("pickle is truncated at byte {at}")]
-    Truncated {
-        /// Where.
-        at: usize,
-    },
-    /// It names a function or class that tensors do not need.
-    #[error("pickle asks for \"{name}\" at byte {at}, which no weights need; nothing was executed")]
-    Forbidden {
-        /// The function or class.
-        name: String,
-        /// Where.
-        at: usize,
-    },
-    /// It holds an instruction that checkpoints do not use.
-    #[error("pickle instruction {opcode:#04x} at byte {at} is none that weights need")]
-    UnknownInstruction {
-        /// The instruction.
-        opcode: u8,
-        /// Where.
-        at: usize,
-    },
-    /// Its instructions do not fit together.
-    #[error("pickle is malformed at byte {at}: {what}")]
-    Malformed {
-        /// Where.
-        at: usize,
-        /// What is wrong.
-        what: &'static str,
-    },
-    /// It is too long.
-    #[error("pickle has more than {MAX_INSTRUCTIONS} instructions")]
-    TooLong,
-}
-
-/// The element type of a storage.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum ElementType {
-    F16,
-    Bf16,
-    F32,
-    F64,
-    /// Integers and booleans, of so many bytes; counters, never weights.
-    Integer(usize),
-}
-
-impl ElementType {
-    pub(super) fn bytes(self) -> usize {
-        match self {
-            Self::F16 | Self::Bf16 => 2,
-            Self::F32 => 4,
-            Self::F64 => 8,
-            Self::Integer(bytes) => bytes,
-        }
-    }
-}
-
-/// A block of elements that lies outside the pickle.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Storage {
-    pub(super) element: ElementType,
-    pub(super) len: usize,
-}
-
-/// A view into a storage; sizes and strides in elements, not checked against the storage.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct TensorRef {
-    pub(super) storage: Rc<str>,
-    pub(super) offset: usize,
-    pub(super) shape: Vec<usize>,
-    pub(super) strides: Vec<usize>,
-}
-
-/// The names a pickle may use.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Global {
-    /// `collections.OrderedDict`, `collections.defaultdict`, `dict`: all become dictionaries.
-    Dict,
-    RebuildTensor,
-    RebuildParameter,
-    Size,
-    Storage(ElementType),
-}
-
-impl Global {
-    fn named(module: &str, name: &str) -> Option<Self> {
-        Some(match (module, name) {
-            ("collections", "OrderedDict" | "defaultdict") | ("builtins" | "__builtin__", "dict") => {
-                Self::Dict
-            }
-            ("torch._utils", "_rebuild_tensor_v2") => Self::RebuildTensor,
-            ("torch._utils", "_rebuild_parameter") => Self::RebuildParameter,
-            ("torch", "Size") => Self::Size,
-            ("torch", "HalfStorage") => Self::Storage(ElementType::F16),
-            ("torch", "BFloat16Storage") => Self::Storage(ElementType::Bf16),
-            ("torch", "FloatStorage") => Self::Storage(ElementType::F32),
-            ("torch", "DoubleStorage") => Self::Storage(ElementType::F64),
-            ("torch", "LongStorage") => Self::Storage(ElementType::Integer(8)),
-            ("torch", "IntStorage") => Self::Storage(ElementType::Integer(4)),
-            ("torch", "ShortStorage") => Self::Storage(ElementType::Integer(2)),
-            ("torch", "CharStorage" | "ByteStorage" | "BoolStorage") => {
-                Self::Storage(ElementType::Integer(1))
-            }
-            _ => return None,
-        })
-    }
-}
-
-/// What a pickle builds; containers are indices into the arenas of [`Pickle`].
-#[derive(Clone, Debug, PartialEq)]
-pub(super) enum Value {
-    None,
-    Bool(bool),
-    Int(i128),
-    Float,
-    Str(Rc<str>),
-    Tuple(usize),
-    List(usize),
-    Dict(usize),
-    Global(Global),
-    Storage(Rc<str>),
-    Tensor(Rc<TensorRef>),
-}
-
-impl Value {
-    fn as_size(&self) -> Option<usize> {
-        match self {
-            Self::Int(value) => usize::try_from(*value).ok(),
-            _ => None,
-        }
-    }
-}
-
-/// A finished pickle.
-#[derive(Debug)]
-pub(super) struct Pickle {
-    pub(super) root: Value,
-    /// Every storage that the pickle refers to, by key.
-    pub(super) storages: BTreeMap<Rc<str>, Storage>,
-    /// Bytes read, up to and including the last instruction.
-    pub(super) bytes: usize,
-    arena: Arena,
-}
-
-#[derive(Debug, Default)]
-struct Arena {
-    sequences: Vec<Vec<Value>>,
-    dicts: Vec<Vec<(Value, Value)>>,
-}
-
-impl Pickle {
-    /// Interprets the pickle that `bytes` start with.
-    pub(super) fn read(bytes: &[u8]) -> Result<Self, PickleError> {
-        let mut machine = Machine {
-            bytes,
-            at: 0,
-            instruction_at: 0,
-            stack: Vec::new(),
-            marks: Vec::new(),
-            memo: HashMap::new(),
-            storages: BTreeMap::new(),
-            arena: Arena::default(),
-        };
-        for _ in 0..MAX_INSTRUCTIONS {
-            machine.instruction_at = machine.at;
-            if let Some(root) = machine.step()? {
-                let Machine { at, storages, arena, .. } = machine;
-                return Ok(Self { root, storages, bytes: at, arena });
-            }
-        }
-        Err(PickleError::TooLong)
-    }
-
-    /// The items of a list or tuple.
-    pub(super) fn sequence(&self, value: &Value) -> Option<&[Value]> {
-        match value {
-            Value::List(index) | Value::Tuple(index) => Some(&self.arena.sequences[*index]),
-            _ => None,
-        }
-    }
-
-    /// The entries of a dictionary whose keys are strings, in the order of the file.
-    pub(super) fn entries(&self, value: &Value) -> Option<impl Iterator<Item = (&Rc<str>, &Value)>> {
-        let Value::Dict(index) = value else { return None };
-        Some(self.arena.dicts[*index].iter().filter_map(|(key, value)| match key {
-            Value::Str(key) => Some((key, value)),
-            _ => None,
-        }))
-    }
-
-    /// The value at a key of a dictionary.
-    pub(super) fn get(&self, value: &Value, key: &str) -> Option<&Value> {
-        self.entries(value)?.find_map(|(name, value)| (&**name == key).then_some(value))
-    }
-}
-
-struct Machine<'a> {
+/// The stack machine that a pickle is a program of.
+pub(super) struct Machine<'a> {
     bytes: &'a [u8],
     at: usize,
     instruction_at: usize,
@@ -224,9 +19,29 @@ struct Machine<'a> {
     arena: Arena,
 }
 
-impl Machine<'_> {
+impl<'a> Machine<'a> {
+    pub(super) fn new(bytes: &'a [u8]) -> Self {
+        Self {
+            bytes,
+            at: 0,
+            instruction_at: 0,
+            stack: Vec::new(),
+            marks: Vec::new(),
+            memo: HashMap::new(),
+            storages: BTreeMap::new(),
+            arena: Arena::default(),
+        }
+    }
+
+    /// What was built, when this is its root.
+    pub(super) fn finished(self, root: Value) -> Pickle {
+        let Self { at, storages, arena, .. } = self;
+        Pickle { root, storages, bytes: at, arena }
+    }
+
     /// Carries out one instruction; the root at the last one.
-    fn step(&mut self) -> Result<Option<Value>, PickleError> {
+    pub(super) fn step(&mut self) -> Result<Option<Value>, PickleError> {
+        self.instruction_at = self.at;
         let opcode = self.unsigned(1)? as u8;
         match opcode {
             0x80 => drop(self.unsigned(1)?), // PROTO
@@ -492,69 +307,5 @@ impl Machine<'_> {
             _ => return Err(self.malformed("a call with unknown arguments")),
         }
         Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-
-    #[test]
-    fn code_is_refused_by_name_and_not_run() {
-        // What `pickle.dumps` makes of an object whose `__reduce__` is `(os.system, ("true",))`.
-        let bytes = b"\x80\x02cposix\nsystem\nq\x00X\x04\x00\x00\x00trueq\x01\x85q\x02Rq\x03.";
-        let error = Pickle::read(bytes).expect_err("code");
-        assert_eq!(error, PickleError::Forbidden { name: "posix.system".into(), at: 2 });
-        let bytes = b"\x80\x04\x8c\x08builtins\x8c\x04eval\x93.";
-        let error = Pickle::read(bytes).expect_err("code");
-        assert_eq!(error, PickleError::Forbidden { name: "builtins.eval".into(), at: 18 });
-    }
-
-    #[test]
-    fn containers_are_filled_after_they_were_kept() {
-        let bytes = b"\x80\x02}q\x00(X\x01\x00\x00\x00aK\x05X\x01\x00\x00\x00b]q\x01(K\x01M\x00\x02eu.";
-        let pickle = Pickle::read(bytes).expect("a dictionary");
-        assert_eq!(pickle.get(&pickle.root, "a"), Some(&Value::Int(5)));
-        let list = pickle.get(&pickle.root, "b").expect("an entry");
-        assert_eq!(pickle.sequence(list), Some(&[Value::Int(1), Value::Int(512)][..]));
-        assert_eq!(pickle.bytes, bytes.len());
-    }
-
-    #[test]
-    fn big_integers_keep_their_sign() {
-        let pickle = Pickle::read(b"\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.").expect("a number");
-        assert_eq!(pickle.root, Value::Int(0x1950_a86a_20f9_469c_fc6c));
-        assert_eq!(Pickle::read(b"\x8a\x01\xff.").expect("a number").root, Value::Int(-1));
-    }
-
-    #[test]
-    fn lengths_beyond_the_file_allocate_nothing() {
-        let error = Pickle::read(b"X\xff\xff\xff\xffabc").expect_err("a string of 4 GiB");
-        assert_eq!(error, PickleError::Truncated { at: 8 });
-    }
-
-    #[test]
-    fn nesting_does_not_exhaust_the_stack() {
-        let mut bytes = vec![b')'];
-        bytes.resize(1_000_000, 0x85);
-        bytes.push(b'.');
-        assert!(Pickle::read(&bytes).is_ok());
-        bytes.insert(0, b'(');
-        assert!(matches!(Pickle::read(&vec![b'N'; MAX_INSTRUCTIONS + 1]), Err(PickleError::TooLong)));
-    }
-
-    proptest! {
-        #[test]
-        fn arbitrary_bytes_do_not_panic(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
-            let _ = Pickle::read(&bytes);
-        }
-
-        #[test]
-        fn arbitrary_instructions_do_not_panic(
-            picks in proptest::collection::vec(proptest::sample::select(b"}])(NtaesuRQbqhK\x85\x86.".to_vec()), 0..60),
-        ) {
-            let _ = Pickle::read(&picks);
-        }
     }
 }
