@@ -9,9 +9,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     // What carries the bytes of blobs copies none.
     tonic_prost_build::configure()
         .btree_map(".")
-        .bytes(".planesweep.v1.FetchChunk")
-        .bytes(".planesweep.v1.ReadChunk")
-        .bytes(".planesweep.v1.WriteChunk.data")
+        .bytes(".planesweep.v1.BlobChunk.data")
         .compile_fds(files)?;
     Ok(())
 }

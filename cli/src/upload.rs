@@ -62,6 +62,6 @@ async fn send(store: Store, key: BlobKey, path: PathBuf) -> Result<bool> {
     if BlobKey::of(&bytes) != key {
         bail!("{} has changed while the run was planned", path.display());
     }
-    store.put(bytes.into()).await.with_context(what)?;
+    store.write(bytes.into()).await.with_context(what)?;
     Ok(true)
 }

@@ -9,22 +9,19 @@ use planesweep_plan::{Job, JobId, RunId};
 use planesweep_proto::wire::coordinator_server::CoordinatorServer;
 use planesweep_proto::{
     CheckToken, JobResult, Order, Refusals, RunStatus, ServerTls, ServiceError, StorePlace, SubmitHeader,
-    Submitted, TlsError, check_jobs, serve,
+    Submitted, TlsError, check_jobs, probing_server, serve,
 };
 use thiserror::Error;
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::service::interceptor::InterceptedService;
-use tonic::transport::Server;
 
 use crate::config::{Config, ConfigError};
 use crate::driver::{Driver, DriverHandle, Message, Settings};
 use crate::ledger::{Ledger, LedgerError};
 use crate::service::{BlobService, Service, refusal};
 
-/// How often a connection is probed, and how long the answer may take.
-const KEEP_ALIVE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(5));
 /// How long calls may take to end when the server stops.
 const CLOSING: Duration = Duration::from_secs(2);
 
@@ -83,12 +80,8 @@ impl Coordinator {
         health.set_serving::<CoordinatorServer<Service>>().await;
         let stop = CancellationToken::new();
         let stopped = stop.clone().cancelled_owned();
-        let router = Server::builder()
-            .http2_keepalive_interval(Some(KEEP_ALIVE.0))
-            .http2_keepalive_timeout(Some(KEEP_ALIVE.1))
-            .add_service(health_service)
-            .add_service(guarded)
-            .add_optional_service(blobs);
+        let router =
+            probing_server().add_service(health_service).add_service(guarded).add_optional_service(blobs);
         let server_task = serve(router, listener, tls, refusals, stopped);
         Ok(Handle {
             local_addr,

@@ -1,21 +1,26 @@
 //! The store through the coordinator, from the caller's side.
 
 use std::fmt;
+use std::time::Duration;
 
-use bytes::{Bytes, BytesMut};
+use bytes::Bytes;
 use planesweep_plan::BlobKey;
-use tokio_stream::StreamExt;
+use tokio::sync::watch;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 
+use crate::chunks::{answer_to_chunks, blob_chunks, in_time, receive};
 use crate::client::WithToken;
 use crate::failover::Failover;
-use crate::limits::{FETCH_CHUNK_BYTES, MAX_BLOB_BYTES, MAX_EXCHANGE_MESSAGE_BYTES};
+use crate::limits::{CHUNK_TIME, MAX_EXCHANGE_MESSAGE_BYTES};
 use crate::wire::blobs_client::BlobsClient;
-use crate::{Code, ServiceError, wire};
+use crate::{ServiceError, wire};
 
 /// What may be under way before it is read: enough for a fast network, and bounded.
 const WINDOW_BYTES: u32 = 4 << 20;
+/// How long an answer may take, or the first chunk of one, and the next chunk that is sent: the coordinator may have to
+/// read all of a large blob first, and others may come before. A host that vanishes is noticed much sooner.
+const ANSWER_TIME: Duration = Duration::from_mins(10);
 
 type Stub = BlobsClient<InterceptedService<Channel, WithToken>>;
 
@@ -42,36 +47,27 @@ impl BlobClient {
 
     /// Whether the store has the blob, whole and undamaged.
     pub async fn find(&mut self, key: &BlobKey) -> Result<bool, ServiceError> {
-        let request = wire::FindRequest { blob: key.0.to_vec() };
-        let find = |mut stub: Stub| async move { stub.find(request).await };
+        let request = wire::BlobRequest::from(key);
+        let find = |mut stub: Stub| async move { in_time(ANSWER_TIME, stub.find(request)).await? };
         Ok(self.coordinators.call(find).await?.into_inner().found)
     }
 
-    /// The bytes that the store has under this key. Their hash is the caller's to check.
-    pub async fn read(&mut self, key: &BlobKey) -> Result<Bytes, ServiceError> {
-        let request = wire::ReadRequest { blob: key.0.to_vec() };
-        let read = |mut stub: Stub| async move { stub.read(request).await };
-        let mut chunks = self.coordinators.call(read).await?.into_inner();
-        let mut bytes = BytesMut::new();
-        while let Some(chunk) = chunks.next().await {
-            bytes.extend_from_slice(&chunk?.data);
-            if bytes.len() as u64 > MAX_BLOB_BYTES {
-                return Err(ServiceError::new(Code::TooLarge, format!("blob {key} has no end")));
-            }
-        }
-        Ok(bytes.freeze())
+    /// The bytes that the store has under this key; refused when they are more than `at_most`. Their hash is the
+    /// caller's to check.
+    pub async fn read(&mut self, key: &BlobKey, at_most: u64) -> Result<Bytes, ServiceError> {
+        let request = wire::BlobRequest::from(key);
+        let read = |mut stub: Stub| async move { in_time(ANSWER_TIME, stub.read(request)).await? };
+        let chunks = self.coordinators.call(read).await?.into_inner();
+        receive(chunks, key, at_most, CHUNK_TIME).await
     }
 
     /// Stores a blob under the hash of its bytes.
     pub async fn write(&mut self, key: &BlobKey, bytes: Bytes) -> Result<(), ServiceError> {
-        let blob = wire::Blob { key: key.0.to_vec(), length: bytes.len() as u64 };
-        let header = wire::WriteChunk { blob: Some(blob), data: Bytes::new() };
-        let chunks = (0..bytes.len()).step_by(FETCH_CHUNK_BYTES).map(move |start| {
-            let data = bytes.slice(start..bytes.len().min(start + FETCH_CHUNK_BYTES));
-            wire::WriteChunk { blob: None, data }
-        });
-        let chunks = tokio_stream::iter(std::iter::once(header).chain(chunks));
-        let write = |mut stub: Stub| async move { stub.write(chunks).await };
+        let (taking, taken) = watch::channel(());
+        let chunks = blob_chunks(*key, bytes).inspect(move |_| taking.send_replace(()));
+        let chunks = tokio_stream::iter(chunks);
+        let write =
+            |mut stub: Stub| async move { answer_to_chunks(stub.write(chunks), taken, ANSWER_TIME).await? };
         self.coordinators.call(write).await?;
         Ok(())
     }

@@ -29,7 +29,7 @@ impl Credentials {
     pub(crate) fn endpoint(&self, url: &str) -> Result<Endpoint, ServiceError> {
         let invalid = |text: String| ServiceError::new(Code::Invalid, text);
         let no_address = |e: tonic::transport::Error| {
-            let text = with_causes(e.to_string(), std::error::Error::source(&e));
+            let text = with_causes(&e);
             invalid(format!("\"{url}\" is no address: {text}"))
         };
         let endpoint = Endpoint::from_shared(url.to_owned()).map_err(no_address)?;

@@ -2,13 +2,15 @@
 
 use std::fmt;
 
+use bytes::Bytes;
 use thiserror::Error;
 use tonic::Status;
 
 use crate::WireError;
 use crate::credentials::certificate_trouble;
 
-/// What kind of refusal it is. Each has one gRPC code, so it survives the wire.
+/// What kind of refusal it is; it survives the wire. Each has a gRPC code of its own, but for a full disk, which gRPC
+/// does not tell from a message that is too large.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Code {
     /// The message breaks the contract.
@@ -25,14 +27,19 @@ pub enum Code {
     Superseded,
     /// The other side cannot be reached, or is stopping.
     Unavailable,
+    /// The disk under the store or the ledger has no room left.
+    DiskFull,
     /// The ledger or the server failed.
     Internal,
 }
 
+/// In the details of a status: the resource that is exhausted is a disk.
+const DISK_FULL: &[u8] = b"disk full";
+
 impl Code {
     /// Whether the same call may succeed later.
     pub fn is_retryable(self) -> bool {
-        matches!(self, Self::Superseded | Self::Unavailable | Self::Internal)
+        matches!(self, Self::Superseded | Self::Unavailable | Self::DiskFull | Self::Internal)
     }
 }
 
@@ -46,6 +53,7 @@ impl fmt::Display for Code {
             Self::TooLarge => "message too large",
             Self::Superseded => "superseded",
             Self::Unavailable => "unavailable",
+            Self::DiskFull => "no room",
             Self::Internal => "internal error",
         })
     }
@@ -80,7 +88,7 @@ impl From<WireError> for ServiceError {
         } else {
             Code::Invalid
         };
-        Self::new(code, with_causes(error.to_string(), std::error::Error::source(&error)))
+        Self::new(code, with_causes(&error))
     }
 }
 
@@ -91,12 +99,13 @@ impl From<ServiceError> for Status {
             Code::Unauthenticated => tonic::Code::Unauthenticated,
             Code::VersionMismatch => tonic::Code::FailedPrecondition,
             Code::NotFound => tonic::Code::NotFound,
-            Code::TooLarge => tonic::Code::ResourceExhausted,
+            Code::TooLarge | Code::DiskFull => tonic::Code::ResourceExhausted,
             Code::Superseded => tonic::Code::Aborted,
             Code::Unavailable => tonic::Code::Unavailable,
             Code::Internal => tonic::Code::Internal,
         };
-        Self::new(code, error.message)
+        let details = if error.code == Code::DiskFull { DISK_FULL } else { &[] };
+        Self::with_details(code, error.message, Bytes::from_static(details))
     }
 }
 
@@ -109,6 +118,7 @@ impl From<Status> for ServiceError {
             tonic::Code::Unauthenticated | tonic::Code::PermissionDenied => Code::Unauthenticated,
             tonic::Code::FailedPrecondition => Code::VersionMismatch,
             tonic::Code::NotFound => Code::NotFound,
+            tonic::Code::ResourceExhausted if status.details() == DISK_FULL => Code::DiskFull,
             tonic::Code::ResourceExhausted => Code::TooLarge,
             tonic::Code::Aborted => Code::Superseded,
             // Time-outs, broken connections and servers that go away come in all of these.
@@ -122,13 +132,17 @@ impl From<Status> for ServiceError {
             return Self::new(Code::Unauthenticated, advice);
         }
         // "transport error" alone helps nobody.
-        let message = with_causes(status.message().to_owned(), std::error::Error::source(&status));
+        let message = and_causes(status.message().to_owned(), std::error::Error::source(&status));
         Self::new(code, message)
     }
 }
 
 /// What an error says, with what caused it, outermost first, and nothing twice.
-pub(crate) fn with_causes(mut text: String, mut cause: Option<&(dyn std::error::Error + 'static)>) -> String {
+pub fn with_causes(error: &dyn std::error::Error) -> String {
+    and_causes(error.to_string(), error.source())
+}
+
+fn and_causes(mut text: String, mut cause: Option<&(dyn std::error::Error + 'static)>) -> String {
     while let Some(inner) = cause {
         let said = inner.to_string();
         if !text.contains(&said) {
@@ -155,6 +169,7 @@ mod tests {
             Code::TooLarge,
             Code::Superseded,
             Code::Unavailable,
+            Code::DiskFull,
             Code::Internal,
         ] {
             let error = ServiceError::new(code, "said so");

@@ -20,6 +20,7 @@
 #![warn(missing_docs)]
 
 mod blobs;
+mod chunks;
 mod client;
 mod convert;
 mod credentials;
@@ -34,17 +35,18 @@ mod token;
 mod way;
 
 pub use blobs::BlobClient;
+pub use chunks::{ChunkSender, blob_chunks, first_chunk};
 pub use client::{Client, TOKEN_HEADER, bearer};
 pub use convert::{WireError, check_job, check_jobs, decode_job, encode_job};
 pub use credentials::Credentials;
-pub use error::{Code, ServiceError};
+pub use error::{Code, ServiceError, with_causes};
 pub use peer::PeerClient;
 pub use report::{
     Endpoint, Failure, FinishedJob, Grant, HeldJob, Input, JobAttempt, Order, Outcome, Peer, Produced,
     Report, ReportReply, Role, Slots, StorePlace, Success, WorkerState,
 };
 pub use run::{JobResult, JobState, RunStatus, RunSummary, SubmitHeader, Submitted, WorkerStatus};
-pub use tls::{ServerTls, TlsError, serve};
+pub use tls::{ServerTls, TlsError, probing_server, serve};
 pub use token::{CheckToken, Refusals};
 pub use way::{IMAGES_FETCHED, Way, images_fetched, maps_by_way};
 

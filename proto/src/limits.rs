@@ -1,4 +1,7 @@
-//! How large foreign input may be. Each limit is far above honest use and keeps memory bounded.
+//! How large foreign input may be, and how long it may take. Each limit is far above honest use and keeps memory,
+//! and the waiting for others, bounded.
+
+use std::time::Duration;
 
 /// Bytes of one message. The largest honest one is the grant of an `Assemble` job over 100 000
 /// views, about 12 MB.
@@ -25,6 +28,10 @@ pub const MAX_REPORTED: usize = 10_000;
 pub const MAX_PEERS: usize = 10_000;
 /// Bytes of a blob. The largest honest one is the cloud, 15 bytes for each point.
 pub const MAX_BLOB_BYTES: u64 = 1 << 40;
+/// Bytes of a blob that is read as a whole when nobody has said how long it is: a photograph, or weights.
+pub const MAX_FILE_BYTES: u64 = 4 << 30;
+/// How long the next chunk of a blob may take to come, or to be taken.
+pub const CHUNK_TIME: Duration = Duration::from_mins(1);
 /// Bytes of a blob in one chunk on its way between workers, or through the coordinator.
 pub const FETCH_CHUNK_BYTES: usize = 256 << 10;
 /// Bytes of one message with such a chunk: the chunk and its frame.

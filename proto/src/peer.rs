@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
-use bytes::{Bytes, BytesMut};
+use bytes::Bytes;
 use planesweep_plan::BlobKey;
-use tokio_stream::StreamExt;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::Channel;
 
+use crate::chunks::{in_time, receive};
 use crate::client::{KEEP_ALIVE, WithToken};
 use crate::limits::MAX_EXCHANGE_MESSAGE_BYTES;
 use crate::wire::exchange_client::ExchangeClient;
@@ -19,8 +19,6 @@ const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
 const MESSAGE_TIMEOUT: Duration = Duration::from_secs(10);
 /// What may be under way before it is read: enough for a fast network, and bounded.
 const WINDOW_BYTES: u32 = 4 << 20;
-/// Bytes set aside before any came; a length in a message is only somebody's word.
-const FIRST_BYTES: u64 = 64 << 20;
 
 /// A client of one worker; cheap to clone, clones share the connection.
 #[derive(Clone)]
@@ -53,32 +51,20 @@ impl PeerClient {
 
     /// The bytes of a blob of this length. Refused are more or fewer bytes, and such of another hash.
     pub async fn fetch(&mut self, key: &BlobKey, length: u64) -> Result<Bytes, ServiceError> {
-        let request = wire::FetchRequest { blob: key.0.to_vec() };
-        let mut chunks = in_time(self.stub.fetch(request)).await??.into_inner();
-        let mut bytes = BytesMut::with_capacity(length.min(FIRST_BYTES) as usize);
-        while let Some(chunk) = in_time(chunks.next()).await? {
-            bytes.extend_from_slice(&chunk?.data);
-            if bytes.len() as u64 > length {
-                let text = format!("blob {key} comes with more than its {length} bytes");
-                return Err(ServiceError::new(Code::TooLarge, text));
-            }
-        }
+        let request = wire::BlobRequest::from(key);
+        let chunks = in_time(MESSAGE_TIMEOUT, self.stub.fetch(request)).await??.into_inner();
+        let bytes = receive(chunks, key, length, MESSAGE_TIMEOUT).await?;
         if bytes.len() as u64 != length || BlobKey::of(&bytes) != *key {
             let text = format!("blob {key} came with another hash or length");
             return Err(ServiceError::new(Code::Invalid, text));
         }
-        Ok(bytes.freeze())
+        Ok(bytes)
     }
 
     /// Tells the worker that this one has opened its inbox, and returns when the two are connected.
     pub async fn open_inbox(&mut self, inbox: &str) -> Result<(), ServiceError> {
-        in_time(self.stub.open_inbox(wire::OpenInboxRequest { inbox: inbox.to_owned() })).await??;
+        let request = wire::OpenInboxRequest { inbox: inbox.to_owned() };
+        in_time(MESSAGE_TIMEOUT, self.stub.open_inbox(request)).await??;
         Ok(())
     }
-}
-
-async fn in_time<T>(answer: impl Future<Output = T>) -> Result<T, ServiceError> {
-    tokio::time::timeout(MESSAGE_TIMEOUT, answer)
-        .await
-        .map_err(|_| ServiceError::new(Code::Unavailable, "the worker does not answer in time"))
 }

@@ -19,10 +19,13 @@ use tonic::transport::Server;
 use tonic::transport::server::{Router, TcpIncoming};
 use tonic::{Request, Status};
 
+use crate::client::KEEP_ALIVE;
 use crate::{Code, Refusals, ServiceError};
 
 /// How long a handshake may take, and how many may be under way: who connects and says nothing is sent away.
 const HANDSHAKE: (Duration, usize) = (Duration::from_secs(10), 256);
+/// How long a connection without TLS is kept, to be told so, and then to say goodbye.
+const REFUSAL: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(2));
 /// How long nobody is let in after a connection could not be accepted; there may be too many.
 const PAUSE: Duration = Duration::from_millis(100);
 
@@ -73,6 +76,11 @@ impl ServerTls {
     }
 }
 
+/// A server that probes its connections, and closes those on which nobody is there any more.
+pub fn probing_server() -> Server {
+    Server::builder().http2_keepalive_interval(Some(KEEP_ALIVE.0)).http2_keepalive_timeout(Some(KEEP_ALIVE.1))
+}
+
 /// Serves until `stopped`. With an acceptor, who speaks no TLS or does not end the handshake is refused, and counted.
 pub fn serve(
     router: Router,
@@ -100,7 +108,8 @@ async fn refuse(plain: Connections<TcpStream>, refusals: Refusals) {
         let text = "this server has a certificate and speaks TLS only; its address begins with https://";
         Err(ServiceError::new(Code::Unauthenticated, text).into())
     };
-    let server = Server::builder().layer(InterceptorLayer::new(refuse)).add_routes(Routes::default());
+    let server = probing_server().max_connection_age(REFUSAL.0).max_connection_age_grace(REFUSAL.1);
+    let server = server.layer(InterceptorLayer::new(refuse)).add_routes(Routes::default());
     if let Err(error) = server.serve_with_incoming(plain).await {
         tracing::debug!(%error, "callers without TLS are not told so any more");
     }

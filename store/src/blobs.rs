@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use planesweep_plan::BlobKey;
+use planesweep_proto::limits::MAX_FILE_BYTES;
 use planesweep_proto::{BlobClient, Client, Code, ServiceError, StorePlace};
 use tokio_util::sync::CancellationToken;
 
@@ -91,22 +92,44 @@ impl Store {
         match &self.place {
             Place::Objects(objects) => objects.put(key, bytes).await,
             Place::Coordinator { .. } if self.try_holds(key).await? => Ok(()),
-            Place::Coordinator { client, .. } => {
-                client.clone().write(&key, bytes).await.map_err(|source| not_passed_on(key, source))
+            Place::Coordinator { .. } => self.try_write(key, bytes).await,
+        }
+    }
+
+    /// Writes a blob that the store was found not to hold, and returns its key.
+    pub async fn write(&self, bytes: Bytes) -> Result<BlobKey, StoreError> {
+        let key = BlobKey::of(&bytes);
+        patiently(&self.impatience, || self.try_write(key, bytes.clone())).await?;
+        Ok(key)
+    }
+
+    async fn try_write(&self, key: BlobKey, bytes: Bytes) -> Result<(), StoreError> {
+        match &self.place {
+            Place::Objects(objects) => objects.write(key, bytes).await,
+            Place::Coordinator { client, url } => {
+                client.clone().write(&key, bytes).await.map_err(|source| not_passed_on(key, url, source))
             }
         }
     }
 
-    /// Reads a blob and checks its hash.
-    pub async fn get(&self, key: &BlobKey) -> Result<Bytes, StoreError> {
-        patiently(&self.impatience, || self.try_get(*key)).await
+    /// Reads a blob of this length and checks its hash.
+    pub async fn get(&self, key: &BlobKey, length: u64) -> Result<Bytes, StoreError> {
+        patiently(&self.impatience, || self.try_get(*key, length)).await
     }
 
-    async fn try_get(&self, key: BlobKey) -> Result<Bytes, StoreError> {
+    /// Reads a blob of which nobody has said how long it is: a photograph, or weights.
+    pub async fn get_file(&self, key: &BlobKey) -> Result<Bytes, StoreError> {
+        self.get(key, MAX_FILE_BYTES).await
+    }
+
+    async fn try_get(&self, key: BlobKey, at_most: u64) -> Result<Bytes, StoreError> {
         match &self.place {
-            Place::Objects(objects) => objects.get(key).await,
-            Place::Coordinator { client, .. } => {
-                let bytes = client.clone().read(&key).await.map_err(|source| not_passed_on(key, source))?;
+            Place::Objects(objects) => objects.get(key, at_most).await,
+            Place::Coordinator { client, url } => {
+                let bytes = client.clone().read(&key, at_most).await.map_err(|source| match source.code {
+                    Code::TooLarge => StoreError::TooLarge { key, at_most },
+                    _ => not_passed_on(key, url, source),
+                })?;
                 if BlobKey::of(&bytes) == key { Ok(bytes) } else { Err(StoreError::Damaged { key }) }
             }
         }
@@ -120,16 +143,16 @@ impl Store {
     async fn try_holds(&self, key: BlobKey) -> Result<bool, StoreError> {
         match &self.place {
             Place::Objects(objects) => objects.holds(key).await,
-            Place::Coordinator { client, .. } => {
-                client.clone().find(&key).await.map_err(|source| not_passed_on(key, source))
+            Place::Coordinator { client, url } => {
+                client.clone().find(&key).await.map_err(|source| not_passed_on(key, url, source))
             }
         }
     }
 }
 
-fn not_passed_on(key: BlobKey, source: ServiceError) -> StoreError {
+fn not_passed_on(key: BlobKey, url: &str, source: ServiceError) -> StoreError {
     match source.code {
         Code::NotFound => StoreError::Missing { key },
-        _ => StoreError::Coordinator { key, source },
+        _ => StoreError::Coordinator { key, url: url.to_owned(), source },
     }
 }

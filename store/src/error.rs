@@ -3,7 +3,7 @@
 use std::io::{self, ErrorKind};
 
 use planesweep_plan::BlobKey;
-use planesweep_proto::ServiceError;
+use planesweep_proto::{Code, ServiceError};
 use thiserror::Error;
 
 /// Why a blob could not be written or read.
@@ -44,6 +44,8 @@ pub enum StoreError {
     Coordinator {
         /// The blob.
         key: BlobKey,
+        /// The coordinator's store.
+        url: String,
         /// What the coordinator said.
         #[source]
         source: ServiceError,
@@ -60,6 +62,14 @@ pub enum StoreError {
         /// The blob.
         key: BlobKey,
     },
+    /// There are more bytes than the blob has, or than any such blob may have.
+    #[error("blob {key} is in the store with more than {at_most} bytes")]
+    TooLarge {
+        /// The blob.
+        key: BlobKey,
+        /// It has, or may have.
+        at_most: u64,
+    },
     /// The bytes are not those that were written.
     #[error("blob {key} is damaged: its bytes have another hash or length")]
     Damaged {
@@ -71,7 +81,7 @@ pub enum StoreError {
 impl StoreError {
     /// Whether the blob must be made again.
     pub fn is_lost(&self) -> bool {
-        matches!(self, Self::Missing { .. } | Self::Damaged { .. })
+        matches!(self, Self::Missing { .. } | Self::TooLarge { .. } | Self::Damaged { .. })
     }
 
     /// Whether the same call may succeed later: the store cannot be reached, or has no room. Keys that
@@ -89,9 +99,14 @@ impl StoreError {
 
     /// The store whose disk has no room left, if that is the trouble.
     pub fn full_disk(&self) -> Option<&str> {
-        let (Self::Write { url, .. } | Self::Read { url, .. }) = self else { return None };
         let is_full = |kind| matches!(kind, ErrorKind::StorageFull | ErrorKind::QuotaExceeded);
-        self.io_kind().is_some_and(is_full).then_some(url)
+        match self {
+            Self::Write { url, .. } | Self::Read { url, .. } => {
+                self.io_kind().is_some_and(is_full).then_some(url)
+            }
+            Self::Coordinator { url, source, .. } => (source.code == Code::DiskFull).then_some(url),
+            _ => None,
+        }
     }
 
     /// What the system said, when it was the system.
@@ -107,14 +122,21 @@ impl StoreError {
     }
 }
 
-/// An error with what caused it, outermost first.
-pub(crate) fn with_causes(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(inner) = cause {
-        text.push_str(": ");
-        text.push_str(&inner.to_string());
-        cause = inner.source();
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_full_disk_is_the_same_behind_a_coordinator() {
+        let key = BlobKey([1; 32]);
+        let through = |code| {
+            let source = ServiceError::new(code, "said so");
+            StoreError::Coordinator { key, url: "file:///store".to_owned(), source }
+        };
+        let full = through(Code::DiskFull);
+        assert!(full.full_disk() == Some("file:///store") && full.is_passing(), "{full}");
+        let busy = through(Code::Unavailable);
+        assert!(busy.full_disk().is_none() && busy.is_passing(), "{busy}");
+        assert!(!through(Code::TooLarge).is_passing());
     }
-    text
 }

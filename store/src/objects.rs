@@ -6,11 +6,11 @@ use bytes::Bytes;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt, PutMode};
 use planesweep_plan::{BlobHasher, BlobKey};
+use planesweep_proto::with_causes;
 use tokio_stream::{Stream, StreamExt};
 
 use crate::StoreError;
 use crate::address::{self, IfAbsent};
-use crate::error::with_causes;
 use crate::upload::Upload;
 
 /// Under this name a store says who it is.
@@ -100,21 +100,23 @@ impl Objects {
         Upload::new(self.clone(), path_of(&key), key, length)
     }
 
-    /// Reads a blob piece by piece; nobody checks its hash.
+    /// Reads a blob piece by piece, and says how long it is; nobody checks its hash.
     pub async fn read(
         &self,
         key: BlobKey,
-    ) -> Result<impl Stream<Item = Result<Bytes, StoreError>> + Send + 'static, StoreError> {
+    ) -> Result<(u64, impl Stream<Item = Result<Bytes, StoreError>> + Send + 'static), StoreError> {
         let found = self.objects.get(&path_of(&key)).await;
         let found = found.map_err(|source| self.unreadable(key, source))?;
-        let store = self.clone();
-        Ok(found.into_stream().map(move |piece| piece.map_err(|source| store.unreadable(key, source))))
+        let (length, store) = (found.meta.size, self.clone());
+        let pieces =
+            found.into_stream().map(move |piece| piece.map_err(|source| store.unreadable(key, source)));
+        Ok((length, pieces))
     }
 
     /// Whether a blob is there with all its bytes, which are read for that.
     pub async fn holds(&self, key: BlobKey) -> Result<bool, StoreError> {
         let read = async {
-            let mut pieces = self.read(key).await?;
+            let (_, mut pieces) = self.read(key).await?;
             let mut hasher = BlobHasher::default();
             while let Some(piece) = pieces.next().await {
                 hasher.update(&piece?);
@@ -127,9 +129,13 @@ impl Objects {
         }
     }
 
-    pub(crate) async fn get(&self, key: BlobKey) -> Result<Bytes, StoreError> {
-        let read = async { self.objects.get(&path_of(&key)).await?.bytes().await };
-        let bytes = read.await.map_err(|source| self.unreadable(key, source))?;
+    pub(crate) async fn get(&self, key: BlobKey, at_most: u64) -> Result<Bytes, StoreError> {
+        let unreadable = |source| self.unreadable(key, source);
+        let found = self.objects.get(&path_of(&key)).await.map_err(unreadable)?;
+        if found.meta.size > at_most {
+            return Err(StoreError::TooLarge { key, at_most });
+        }
+        let bytes = found.bytes().await.map_err(unreadable)?;
         if BlobKey::of(&bytes) == key { Ok(bytes) } else { Err(StoreError::Damaged { key }) }
     }
 
@@ -140,7 +146,11 @@ impl Objects {
         if is_there && self.holds(key).await.unwrap_or(false) {
             return Ok(());
         }
-        let mut upload = self.upload(key, length);
+        self.write(key, bytes).await
+    }
+
+    pub(crate) async fn write(&self, key: BlobKey, bytes: Bytes) -> Result<(), StoreError> {
+        let mut upload = self.upload(key, bytes.len() as u64);
         upload.write(bytes).await?;
         upload.finish().await
     }

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
+use planesweep_proto::with_causes;
 use tokio_util::sync::CancellationToken;
 
 use crate::StoreError;
-use crate::error::with_causes;
 
 /// Pauses between tries: doubled up to the longest.
 const PAUSES: (Duration, Duration) = (Duration::from_millis(200), Duration::from_secs(5));

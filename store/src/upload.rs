@@ -10,6 +10,9 @@ use crate::{Objects, StoreError};
 /// Larger blobs are written in parts of this size, some at a time.
 const PART_BYTES: usize = 8 << 20;
 const PARTS_AT_A_TIME: usize = 4;
+/// Smaller pieces are copied one after the other into larger ones: each that is kept as it came takes memory beside its
+/// bytes, and may keep alive what it was cut from.
+const KEPT_BYTES: usize = 64 << 10;
 
 /// A blob whose bytes come in pieces, a few parts of it in memory. Nothing of it is to be seen before
 /// [`Upload::finish`]; dropped before that, nothing of it stays.
@@ -34,17 +37,17 @@ impl Upload {
 
     /// Adds the next piece; refused are more bytes than the blob has.
     pub async fn write(&mut self, mut piece: Bytes) -> Result<(), StoreError> {
-        if piece.is_empty() {
-            // Kept, any number of them would take memory.
-            return Ok(());
-        }
         self.written += piece.len() as u64;
         if self.written > self.length {
             return Err(StoreError::Refused { key: self.key });
         }
         self.hasher.update(&piece);
         if self.length < PART_BYTES as u64 {
-            self.first.push(piece);
+            if piece.len() < KEPT_BYTES {
+                self.first.extend_from_slice(&piece);
+            } else {
+                self.first.push(piece);
+            }
             return Ok(());
         }
         while !piece.is_empty() {
@@ -61,7 +64,11 @@ impl Upload {
         }
         if let Some(parts) = &mut self.parts {
             parts.wait_for_capacity(PARTS_AT_A_TIME).await?;
-            parts.put(part);
+            if part.len() < KEPT_BYTES {
+                parts.write(&part);
+            } else {
+                parts.put(part);
+            }
         }
         Ok(())
     }
@@ -89,5 +96,36 @@ impl Drop for Upload {
         if let (Some(parts), Ok(runtime)) = (self.parts.take(), tokio::runtime::Handle::try_current()) {
             runtime.spawn(parts.abort());
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn tiny_pieces_are_gathered() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let store = Objects::open(&format!("file://{}", folder.path().display())).expect("a store");
+        let bytes = vec![7; 100_000];
+        let key = BlobKey::of(&bytes);
+        let mut upload = store.upload(key, bytes.len() as u64);
+        for byte in bytes.chunks(1) {
+            upload.write(Bytes::copy_from_slice(byte)).await.expect("within the length");
+        }
+        let kept = std::mem::take(&mut upload.first).freeze();
+        assert!(kept.iter().count() < 20, "{}", kept.iter().count());
+        assert_eq!(kept.iter().map(Bytes::len).sum::<usize>(), bytes.len());
+
+        // Between large ones they keep their places.
+        let pieces = [&[1; KEPT_BYTES][..], &[2], &[3], &[4; KEPT_BYTES], &[5]];
+        let bytes = pieces.concat();
+        let key = BlobKey::of(&bytes);
+        let mut upload = store.upload(key, bytes.len() as u64);
+        for piece in pieces {
+            upload.write(Bytes::copy_from_slice(piece)).await.expect("within the length");
+        }
+        upload.finish().await.expect("written");
+        assert!(store.get(key, bytes.len() as u64).await.expect("read") == bytes);
     }
 }

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use planesweep_plan::BlobKey;
 use planesweep_proto::limits::{MAX_BLOB_BYTES, MAX_EXCHANGE_MESSAGE_BYTES};
 use planesweep_proto::wire::blobs_client::BlobsClient;
-use planesweep_proto::wire::{Blob, WriteChunk};
+use planesweep_proto::wire::{Blob, BlobChunk};
 use planesweep_proto::{Client, StorePlace};
 use planesweep_store::{Objects, Store, StoreError};
 use planesweep_tests::{Bench, Cluster, S3Server, files_below, wait_until};
@@ -33,18 +33,21 @@ fn conforms(store: &Store, folder: &Path) {
 async fn what_is_put_comes_back_once(store: &Store, folder: &Path) {
     let key = store.put(Bytes::from_static(b"depth")).await.expect("written");
     assert_eq!(store.put(Bytes::from_static(b"depth")).await.expect("written"), key);
-    assert_eq!(store.get(&key).await.expect("read"), &b"depth"[..]);
+    assert_eq!(store.get_file(&key).await.expect("read"), &b"depth"[..]);
     assert!(store.holds(&key).await.expect("asked"));
     assert_eq!(blob_files(folder).len(), 1, "a blob is one file, and nothing is left beside it");
+    assert_eq!(store.get(&key, 5).await.expect("read"), &b"depth"[..]);
+    let error = store.get(&key, 4).await.expect_err("more than it may have");
+    assert!(matches!(error, StoreError::TooLarge { at_most: 4, .. }) && error.is_lost(), "{error}");
     let empty = store.put(Bytes::new()).await.expect("written");
-    assert_eq!(store.get(&empty).await.expect("read"), &b""[..]);
+    assert_eq!(store.get_file(&empty).await.expect("read"), &b""[..]);
 }
 
 async fn large_blobs_come_back(store: &Store) {
     let bytes: Bytes = (0..LARGE).map(|k| (k * 31 % 251) as u8).collect::<Vec<u8>>().into();
     let key = store.put(bytes.clone()).await.expect("written");
     assert!(store.holds(&key).await.expect("asked"));
-    assert!(store.get(&key).await.expect("read") == bytes);
+    assert!(store.get_file(&key).await.expect("read") == bytes);
 }
 
 async fn a_flipped_bit_is_found_and_mended(store: &Store, folder: &Path) {
@@ -52,16 +55,16 @@ async fn a_flipped_bit_is_found_and_mended(store: &Store, folder: &Path) {
     let is_it = |path: &PathBuf| fs::read(path).is_ok_and(|bytes| bytes == b"confidence");
     let file = blob_files(folder).into_iter().find(is_it).expect("a blob is a file");
     fs::write(&file, b"confidencE").expect("spoilt");
-    let error = store.get(&key).await.expect_err("damaged");
+    let error = store.get_file(&key).await.expect_err("damaged");
     assert!(matches!(error, StoreError::Damaged { .. }) && error.is_lost() && !error.is_passing());
     assert!(!store.holds(&key).await.expect("asked"));
     store.put(Bytes::from_static(b"confidence")).await.expect("written again");
-    assert!(store.get(&key).await.is_ok());
+    assert!(store.get_file(&key).await.is_ok());
 }
 
 async fn a_missing_blob_is_named(store: &Store) {
     let key = BlobKey::of(b"never written");
-    let error = store.get(&key).await.expect_err("missing");
+    let error = store.get_file(&key).await.expect_err("missing");
     assert_eq!(error.to_string(), format!("blob {key} is not in the store"));
     assert!(error.is_lost() && !store.holds(&key).await.expect("asked"));
 }
@@ -116,7 +119,7 @@ fn a_coordinator_never_has_a_large_blob_as_a_whole_in_memory() {
     let before = most_mib();
     let bytes: Bytes = (0..BLOB / 4).flat_map(|k| (k as u32).to_le_bytes()).collect::<Vec<u8>>().into();
     let key = runtime.block_on(store.put(bytes.clone())).expect("written");
-    assert!(runtime.block_on(store.get(&key)).expect("read") == bytes);
+    assert!(runtime.block_on(store.get_file(&key)).expect("read") == bytes);
     let more = most_mib() - before;
     eprintln!("{more} MiB for a blob of {} MiB", BLOB >> 20);
     assert!(more < BLOB >> 21, "{more} MiB");
@@ -140,7 +143,7 @@ fn another_store_at_the_same_address_is_not_taken_for_it() {
         assert!(of("one").await.is_reached_from_here());
         let other = of("two").await;
         assert!(!other.is_reached_from_here());
-        let error = other.get(&BlobKey::of(b"x")).await.expect_err("nobody listens");
+        let error = other.get_file(&BlobKey::of(b"x")).await.expect_err("nobody listens");
         assert!(error.is_passing() && !error.is_lost(), "{error}");
     });
 }
@@ -150,18 +153,18 @@ fn what_is_sent_to_a_coordinator_under_a_wrong_name_is_refused_and_leaves_nothin
     let bench = Bench::new(|_| {});
     let cluster = Cluster::start(&bench, &[]);
     let url = cluster.url().to_owned();
-    let send = async |chunks: Vec<WriteChunk>| {
+    let send = async |chunks: Vec<BlobChunk>| {
         let mut stub = BlobsClient::connect(url.clone()).await.expect("it listens");
         let refused = stub.write(tokio_stream::iter(chunks)).await.expect_err("refused");
         (refused.code(), refused.message().to_owned())
     };
     let first = |length: u64| {
         let key = BlobKey::of(b"depth").0.to_vec();
-        WriteChunk { blob: Some(Blob { key, length }), data: Bytes::new() }
+        BlobChunk { blob: Some(Blob { key, length }), data: Bytes::new() }
     };
-    let data = |bytes: &'static [u8]| WriteChunk { blob: None, data: Bytes::from_static(bytes) };
+    let data = |bytes: &'static [u8]| BlobChunk { blob: None, data: Bytes::from_static(bytes) };
     let larger = vec![0; MAX_EXCHANGE_MESSAGE_BYTES + 1];
-    let larger = WriteChunk { blob: None, data: larger.into() };
+    let larger = BlobChunk { blob: None, data: larger.into() };
     let name = BlobKey::of(b"depth").to_string();
     Runtime::new().expect("a runtime").block_on(async {
         for (what, chunks, code, says) in [
@@ -218,11 +221,11 @@ fn an_s3_server_is_a_store_that_may_go_and_come_back() {
     assert!(!write.is_finished(), "it waits for the server");
     server.come_back();
     let key = runtime.block_on(write).expect("no panic").expect("written");
-    assert_eq!(runtime.block_on(store.get(&key)).expect("read"), &b"written while nobody listens"[..]);
+    assert_eq!(runtime.block_on(store.get_file(&key)).expect("read"), &b"written while nobody listens"[..]);
 
     server.go_away();
     impatience.cancel();
-    let error = runtime.block_on(store.get(&key)).expect_err("nobody listens");
+    let error = runtime.block_on(store.get_file(&key)).expect_err("nobody listens");
     assert!(error.is_passing() && !error.is_lost(), "{error}");
 }
 

@@ -3,7 +3,7 @@
 use planesweep_fusion::EmptyCloud;
 use planesweep_mvsnet::InferError;
 use planesweep_plan::JobId;
-use planesweep_proto::Failure;
+use planesweep_proto::{Failure, with_causes};
 use planesweep_scene::StitchError;
 use thiserror::Error;
 
@@ -113,18 +113,6 @@ impl JobError {
     pub fn is_fatal(&self) -> bool {
         matches!(self, Self::Device(DeviceError::Load { .. } | DeviceError::Gone))
     }
-}
-
-/// An error with what caused it, outermost first.
-pub(crate) fn with_causes(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(inner) = cause {
-        text.push_str(": ");
-        text.push_str(&inner.to_string());
-        cause = inner.source();
-    }
-    text
 }
 
 #[cfg(test)]

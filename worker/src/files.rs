@@ -66,7 +66,7 @@ impl Files {
             Err(not_here) => not_here,
         };
         tracing::debug!(path = %path.display(), "fetching from the store");
-        let bytes = match self.store.get(&hash).await {
+        let bytes = match self.store.get_file(&hash).await {
             Ok(bytes) => bytes,
             Err(error) if error.is_lost() => return Err(not_here),
             Err(source) => return Err(FileError::Store { path, source }),

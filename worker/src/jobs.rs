@@ -244,7 +244,8 @@ impl Jobs {
         let mut clouds = Vec::with_capacity(inputs.len());
         for Input { job, produced } in inputs {
             let Some(produced) = produced else { continue };
-            let bytes = self.store.get(&produced.blob).await.map_err(|source| unreadable(*job, source));
+            let bytes = self.store.get(&produced.blob, produced.length).await;
+            let bytes = bytes.map_err(|source| unreadable(*job, source));
             clouds.push(bytes.map(|bytes| (*job, bytes)));
         }
         let clouds: Vec<(JobId, Bytes)> = all_or_lost(clouds)?;

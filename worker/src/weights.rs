@@ -23,7 +23,7 @@ impl WeightsFiles {
         if let Some((_, bytes)) = latest.as_ref().filter(|(have, _)| have == key) {
             return Ok(bytes.clone());
         }
-        let bytes = self.store.get(key).await?;
+        let bytes = self.store.get_file(key).await?;
         *latest = Some((*key, bytes.clone()));
         Ok(bytes)
     }

@@ -172,8 +172,8 @@ fn by_view<'a>(jobs: &[Job], results: &'a [JobResult]) -> ByView<'a> {
 }
 
 fn blob(run: &Finished<'_>, result: &JobResult) -> Result<Option<Bytes>> {
-    let Some((key, _)) = &result.blob else { return Ok(None) };
-    Ok(Some(run.runtime.block_on(run.store.get(key))?))
+    let Some((key, length)) = &result.blob else { return Ok(None) };
+    Ok(Some(run.runtime.block_on(run.store.get(key, *length))?))
 }
 
 /// Writes depth, confidence and preview; `None` when the view's inference failed.

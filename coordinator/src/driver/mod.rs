@@ -18,7 +18,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use planesweep_plan::{JobId, WorkerId};
-use planesweep_proto::{Code, Order, Produced, Role, ServiceError, StorePlace, WorkerState, WorkerStatus};
+use planesweep_proto::{
+    Code, Order, Produced, Role, ServiceError, StorePlace, WorkerState, WorkerStatus, with_causes,
+};
 use tokio::sync::{mpsc, watch};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
@@ -176,7 +178,7 @@ impl Driver {
         }
         self.ticked = now;
         if let Err(error) = self.catch_up().await {
-            tracing::warn!(error = describe(&error), "the ledger does not answer");
+            tracing::warn!(error = with_causes(&error), "the ledger does not answer");
             self.seen = None;
             return;
         }
@@ -212,12 +214,12 @@ impl Driver {
             // Nothing is decided until it can be written down: workers keep what they have, and report again.
             format!("disk full at {}; nothing goes on until there is room", self.ledger.place())
         } else {
-            describe(error)
+            with_causes(error)
         };
         tracing::error!(error = text, "the ledger failed; it is read anew");
         self.seen = None;
         if let Err(error) = self.catch_up().await {
-            tracing::error!(error = describe(&error), "the ledger cannot be read");
+            tracing::error!(error = with_causes(&error), "the ledger cannot be read");
         }
         ServiceError::new(Code::Internal, text)
     }
@@ -261,15 +263,4 @@ async fn read(
     });
     let snapshot = Snapshot::new(lease.as_millis() as u64, records, now);
     Ok((snapshot, results, step))
-}
-
-/// An error with its causes, in one line.
-pub(crate) fn describe(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut source = error.source();
-    while let Some(cause) = source {
-        text = format!("{text}: {cause}");
-        source = cause.source();
-    }
-    text
 }

@@ -3,13 +3,13 @@
 use planesweep_plan::{Attempt, JobId, WorkerId};
 use planesweep_proto::{
     Code, Failure, Grant, Input, JobAttempt, Order, Outcome, Peer, Report, ReportReply, ServiceError,
-    WorkerState,
+    WorkerState, with_causes,
 };
 
 use super::carry_out::Payload;
 use super::message::Reply;
 use super::peers::{Place, peers};
-use super::{Driver, WorkerInfo, describe};
+use super::{Driver, WorkerInfo};
 use crate::ledger::{LedgerError, Step};
 use crate::schedule::{Command, Ending, Event, Finished, FreeSlots, Held, Timestamp, decide};
 
@@ -161,7 +161,7 @@ impl Driver {
     ) -> Result<(), LedgerError> {
         let failure = Outcome::Failure(Failure {
             code: "unreadable".to_owned(),
-            message: describe(error),
+            message: with_causes(error),
             retryable: false,
             counts_against_job: true,
             lost_inputs: Vec::new(),

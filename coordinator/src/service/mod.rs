@@ -10,13 +10,15 @@ use std::sync::Arc;
 use planesweep_plan::NUMERICS_VERSION;
 use planesweep_proto::limits::MAX_MESSAGE_BYTES;
 use planesweep_proto::wire::coordinator_server::{Coordinator, CoordinatorServer};
-use planesweep_proto::{CODE_VERSION, Code, PROTOCOL_VERSION, Refusals, ServiceError, StorePlace, wire};
+use planesweep_proto::{
+    CODE_VERSION, Code, PROTOCOL_VERSION, Refusals, ServiceError, StorePlace, wire, with_causes,
+};
 use tokio_stream::Stream;
 use tonic::{Request, Response, Status, Streaming};
 
 pub(crate) use blobs::BlobService;
 
-use crate::driver::{DriverHandle, describe};
+use crate::driver::DriverHandle;
 use crate::ledger::{Ledger, LedgerError};
 
 /// What the handlers need.
@@ -112,5 +114,5 @@ pub(crate) fn refusal(error: &LedgerError) -> ServiceError {
         LedgerError::NoSuchRun { .. } => Code::NotFound,
         _ => Code::Internal,
     };
-    ServiceError::new(code, describe(error))
+    ServiceError::new(code, with_causes(error))
 }

@@ -1,8 +1,12 @@
 //! Wire to domain and back. All foreign input is checked here, once: behind this module numbers
 //! are finite, rotations are rotations, hashes have 32 bytes and counts are within the limits.
 
+mod blob;
 mod check;
+mod filter;
+mod image;
 mod job;
+mod reply;
 mod report;
 mod run;
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 use planesweep_plan::{Attempt, JobId, RunId, WorkerId};
 use planesweep_scene::ViewId;
 
-use super::check::{at_most, blob_key, each, job_id, measurements, name, not_negative, optional_name, short};
+use super::check::{at_most, each, job_id, measurements, name, not_negative, optional_name, short};
 use super::report::{role, worker_state};
 use crate::limits::{MAX_JOBS, MAX_MESSAGE_TEXT_BYTES, MAX_REPORTED};
 use crate::{
@@ -116,7 +116,7 @@ impl From<&JobResult> for wire::JobResult {
             state: wire::JobState::from(result.state).into(),
             attempt: result.attempt.0,
             ended: result.ended,
-            blob: result.blob.map(|(key, length)| wire::Blob { key: key.0.to_vec(), length }),
+            blob: result.blob.map(Into::into),
             measurements: result.measurements.clone(),
             seconds: result.seconds,
             worker: result.worker.as_ref().map(|WorkerId(id)| id.clone()).unwrap_or_default(),
@@ -130,10 +130,7 @@ impl TryFrom<wire::JobResult> for JobResult {
     type Error = WireError;
 
     fn try_from(result: wire::JobResult) -> Result<Self, WireError> {
-        let blob = match result.blob {
-            None => None,
-            Some(blob) => Some((blob_key("result blob", &blob.key)?, blob.length)),
-        };
+        let blob = result.blob.map(TryInto::try_into).transpose()?;
         let code = optional_name("failure code", result.failure_code)?;
         let message = short("failure message", result.failure_message, MAX_MESSAGE_TEXT_BYTES)?;
         let worker = optional_name("worker", result.worker)?;

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::net::{IpAddr, Ipv4Addr};
 
 use nalgebra::{Point3, Vector3};
-use planesweep_proto::{Code, PeerClient, wire};
+use planesweep_proto::{Code, PeerClient, first_chunk, wire};
 use planesweep_scene::{Camera, DepthMap, Intrinsics, Pose, Raster};
 use tempfile::TempDir;
 use tonic::codegen::BoxStream;
@@ -50,8 +50,7 @@ impl Party {
         let maps = Arc::new(Maps::new(64 << 20));
         let config = ExchangeConfig { listen: LOOPBACK, tls: None, shared_memory };
         let credentials = Credentials::of_token(token);
-        let exchange =
-            Exchange::start(&config, &id, "host", role, credentials, Arc::clone(&maps), INBOX_BYTES);
+        let exchange = Exchange::start(&config, &id, "host", role, credentials, Arc::clone(&maps), INBOX_BYTES);
         Self { exchange: exchange.await.expect("loopback is there"), id, maps }
     }
 
@@ -279,14 +278,15 @@ struct Liar(Vec<Vec<u8>>);
 
 #[tonic::async_trait]
 impl wire::exchange_server::Exchange for Liar {
-    type FetchStream = BoxStream<wire::FetchChunk>;
+    type FetchStream = BoxStream<wire::BlobChunk>;
 
-    async fn fetch(&self, _: Request<wire::FetchRequest>) -> Result<Response<Self::FetchStream>, Status> {
+    async fn fetch(&self, _: Request<wire::BlobRequest>) -> Result<Response<Self::FetchStream>, Status> {
         // The last chunk comes again and again, without an end.
         let last = self.0.last().filter(|chunk| chunk.len() > 1).cloned();
         let chunks =
             self.0.clone().into_iter().chain(std::iter::repeat_with(move || last.clone()).map_while(|c| c));
-        let chunks = chunks.map(|data| Ok(wire::FetchChunk { data: data.into() }));
+        let chunks = chunks.map(|data| wire::BlobChunk { blob: None, data: data.into() });
+        let chunks = std::iter::once(first_chunk(BlobKey::of(b"map"), 3)).chain(chunks).map(Ok);
         Ok(Response::new(Box::pin(tokio_stream::iter(chunks))))
     }
 

@@ -185,7 +185,7 @@ impl Exchange {
         if let Some(bytes) = self.peers.get(wanted).await {
             return Ok((bytes, Way::Stream));
         }
-        Ok((store.get(&wanted.blob).await?, Way::Store))
+        Ok((store.get(&wanted.blob, wanted.length).await?, Way::Store))
     }
 }
 

@@ -4,12 +4,11 @@ use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use planesweep_plan::WorkerId;
-use planesweep_proto::Peer;
+use planesweep_proto::{Peer, with_causes};
 use thiserror::Error;
 
 use super::peers::Peers;
 use super::{Outbox, SharedMemoryError};
-use crate::failure::with_causes;
 use crate::jobs::compute;
 
 /// The way to the host's inbox: opened when there is a map to be sent, opened anew when the inbox is

@@ -2,26 +2,25 @@
 
 use std::io;
 use std::sync::Arc;
-use std::time::Duration;
 
 use planesweep_plan::BlobKey;
-use planesweep_proto::limits::{FETCH_CHUNK_BYTES, MAX_EXCHANGE_MESSAGE_BYTES};
+use planesweep_proto::limits::{CHUNK_TIME, MAX_EXCHANGE_MESSAGE_BYTES};
 use planesweep_proto::wire::exchange_server::{Exchange, ExchangeServer};
-use planesweep_proto::{CheckToken, Code, Refusals, ServerTls, ServiceError, bearer, serve, wire};
+use planesweep_proto::{
+    CheckToken, ChunkSender, Code, Refusals, ServerTls, ServiceError, bearer, blob_chunks, probing_server,
+    serve, wire,
+};
 use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tokio::task::spawn_blocking;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::codegen::BoxStream;
 use tonic::service::interceptor::InterceptedService;
-use tonic::transport::Server;
 use tonic::{Request, Response, Status};
 
 use super::{ExchangeConfig, ExchangeError, Inbox};
 use crate::maps::Maps;
 
-/// How often a connection is probed, and how long the answer may take.
-const KEEP_ALIVE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(5));
 /// Maps on their way at once, each as a whole in memory; who asks beyond that waits.
 const MAX_FETCHES: usize = 4;
 
@@ -63,10 +62,7 @@ pub(crate) async fn start_serving(
     let stopped = stop.clone().cancelled_owned();
     let refusals = Refusals::default();
     let check = CheckToken { expected, refusals: refusals.clone() };
-    let router = Server::builder()
-        .http2_keepalive_interval(Some(KEEP_ALIVE.0))
-        .http2_keepalive_timeout(Some(KEEP_ALIVE.1))
-        .add_service(InterceptedService::new(service, check));
+    let router = probing_server().add_service(InterceptedService::new(service, check));
     let server = serve(router, listener, tls, refusals, stopped);
     tokio::spawn(async move {
         if let Ok(Err(error)) = server.await {
@@ -84,32 +80,31 @@ struct Service {
 
 #[tonic::async_trait]
 impl Exchange for Service {
-    type FetchStream = BoxStream<wire::FetchChunk>;
+    type FetchStream = BoxStream<wire::BlobChunk>;
 
     async fn fetch(
         &self,
-        request: Request<wire::FetchRequest>,
+        request: Request<wire::BlobRequest>,
     ) -> Result<Response<Self::FetchStream>, Status> {
-        let key: [u8; 32] = (request.into_inner().blob.as_slice())
-            .try_into()
-            .map_err(|_| ServiceError::new(Code::Invalid, "a blob's key has 32 bytes"))?;
+        let key = BlobKey::try_from(request.into_inner()).map_err(ServiceError::from)?;
         let turn = self.turns.clone().acquire_owned().await;
         let turn = turn.map_err(|_| ServiceError::new(Code::Unavailable, "the worker is stopping"))?;
         let maps = Arc::clone(&self.maps);
-        let bytes = spawn_blocking(move || maps.bytes_of(&BlobKey(key))).await;
-        let Ok(Some(mut bytes)) = bytes else {
-            let text = format!("blob {} is not in memory any more", BlobKey(key));
+        let bytes = spawn_blocking(move || maps.bytes_of(&key)).await;
+        let Ok(Some(bytes)) = bytes else {
+            let text = format!("blob {key} is not in memory any more");
             return Err(ServiceError::new(Code::NotFound, text).into());
         };
-        // Chunks are taken when the reader has room for them.
-        let chunks = std::iter::from_fn(move || {
-            let _until_the_last = &turn;
-            (!bytes.is_empty()).then(|| {
-                let data = bytes.split_to(bytes.len().min(FETCH_CHUNK_BYTES));
-                Ok(wire::FetchChunk { data })
-            })
+        let (reader, answer) = ChunkSender::new(CHUNK_TIME);
+        tokio::spawn(async move {
+            let _until_the_last = turn;
+            for chunk in blob_chunks(key, bytes) {
+                if !reader.send(chunk).await {
+                    return;
+                }
+            }
         });
-        Ok(Response::new(Box::pin(tokio_stream::iter(chunks))))
+        Ok(Response::new(answer))
     }
 
     async fn open_inbox(
