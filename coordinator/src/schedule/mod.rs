@@ -32,6 +32,7 @@
 //! - While a worker that takes its class lives and reports, every job that a run wants ends.
 
 mod assign;
+mod change;
 mod event;
 mod lease;
 mod report;
