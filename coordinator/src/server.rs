@@ -64,6 +64,9 @@ impl Coordinator {
         let local_addr =
             listener.local_addr().map_err(|source| StartError::Listen { listen: config.listen, source })?;
         let ledger = Arc::new(Ledger::open(&config.ledger).await?);
+        if let Some(served) = &config.served {
+            ledger.tie_to_store(&served.identity, served.store.url()).await?;
+        }
         let closed = CancellationToken::new();
         let identity = config.served.as_ref().map(|served| served.identity.clone());
         let store = StorePlace { url: config.store_url.clone(), identity };

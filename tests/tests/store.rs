@@ -11,7 +11,7 @@ use planesweep_proto::wire::blobs_client::BlobsClient;
 use planesweep_proto::wire::{Blob, BlobChunk};
 use planesweep_proto::{Client, StorePlace};
 use planesweep_store::{Objects, Store, StoreError};
-use planesweep_tests::{Bench, Cluster, S3Server, files_below, wait_until};
+use planesweep_tests::{Bench, Cluster, S3Server, files_below, run, wait_until};
 use tokio::runtime::Runtime;
 use tokio_util::sync::CancellationToken;
 
@@ -199,6 +199,20 @@ fn what_is_sent_to_a_coordinator_under_a_wrong_name_is_refused_and_leaves_nothin
     assert!(!runtime.block_on(store.holds(&BlobKey::of(b"depth"))).expect("asked"));
     let is_empty = || blob_files(Path::new(&bench.path("store"))).is_empty();
     assert!(wait_until(DEADLINE, is_empty), "{:?}", blob_files(Path::new(&bench.path("store"))));
+}
+
+#[test]
+fn a_coordinator_whose_ledger_has_another_store_is_refused_and_told_what_to_do() {
+    let bench = Bench::new(|_| {});
+    let _ = Cluster::start(&bench, &[]).drain().wait().expect_code(0);
+    let (ledger, other) = (bench.path("ledger.sqlite"), bench.path("other"));
+    let given = ["coordinator", "--listen", "127.0.0.1:0", "--ledger", &ledger, "--store", &other];
+    let refused = run(given).expect_code(1);
+    let identity = fs::read_to_string(bench.path("store/identity")).expect("it says who it is");
+    let advice = format!("write {identity} into the object \"identity\" of file://{other}");
+    assert!(refused.stderr.contains(&advice), "{}", refused.stderr);
+    fs::write(format!("{other}/identity"), identity).expect("written");
+    let _ = Cluster::start_on(&ledger, &other, Vec::new(), &[]).drain().wait().expect_code(0);
 }
 
 #[test]

@@ -44,6 +44,20 @@ pub enum LedgerError {
         /// What is understood.
         expected: i64,
     },
+    /// Its results lie elsewhere.
+    #[error(
+        "the results of the ledger {ledger} lie in another store than {url}; name that one, or begin another ledger. If \
+         that store was emptied or replaced on purpose, write {identity} into the object \"identity\" of {url}: what is \
+         missing there is computed again"
+    )]
+    OtherStore {
+        /// The ledger.
+        ledger: LedgerPlace,
+        /// The store that was named.
+        url: String,
+        /// What the ledger's store says of itself.
+        identity: String,
+    },
     /// A statement failed.
     #[error("could not {what} in the ledger")]
     Statement {

@@ -23,6 +23,7 @@ mod query;
 mod rows;
 mod schema;
 mod step;
+mod store;
 
 use std::fs::{File, TryLockError};
 use std::path::Path;

@@ -5,23 +5,25 @@ use sqlx::{AnyPool, AssertSqlSafe, Executor};
 use super::{Kind, LedgerError, LedgerPlace};
 
 /// Raised with every change of the tables.
-const SCHEMA: i64 = 3;
+const SCHEMA: i64 = 4;
 
 /// `jobs.position` is the order of submission, and so the order of the plan. What a job needs is a
 /// list of ids in one column rather than a table of edges: it is written once, read whole, and the
 /// graph of 100 000 views has two million edges. `jobs.changed` is the step that changed the row last.
 ///
 /// `counters` has one row. `step` rises with every step; it is also the lock that keeps the steps of
-/// several coordinators apart. `ended` is the highest `jobs.ended` there ever was.
+/// several coordinators apart. `ended` is the highest `jobs.ended` there ever was. `store` is
+/// what the store of the results says of itself, once a coordinator has come with one.
 ///
 /// SERIAL_KEY and BYTES stand for what the two databases call differently.
 const TABLES: &str = "
 CREATE TABLE counters (
     schema_version BIGINT NOT NULL,
     step           BIGINT NOT NULL,
-    ended          BIGINT NOT NULL
+    ended          BIGINT NOT NULL,
+    store          TEXT
 );
-INSERT INTO counters (schema_version, step, ended) VALUES (3, 0, 0);
+INSERT INTO counters (schema_version, step, ended) VALUES (4, 0, 0);
 CREATE TABLE runs (
     number    BIGINT PRIMARY KEY,
     id        TEXT NOT NULL UNIQUE,

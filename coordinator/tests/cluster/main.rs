@@ -8,13 +8,14 @@ mod toy;
 
 use std::time::Duration;
 
-use planesweep_coordinator::{Config, Coordinator, StartError};
+use planesweep_coordinator::{Config, Coordinator, LedgerError, ServedStore, StartError};
 use planesweep_plan::{Attempt, Job, NUMERICS_VERSION, RunId, WorkerId};
 use planesweep_proto::wire::coordinator_client::CoordinatorClient;
 use planesweep_proto::{
     CODE_VERSION, Client, Code, JobState, Outcome, PROTOCOL_VERSION, ServiceError, SubmitHeader,
 };
 
+use planesweep_store::Objects;
 use toy::{DEADLINE, Place, Toy, cloud, config, finished, plan, result_of, start, submit, undisturbed};
 
 /// What every ledger must do.
@@ -42,6 +43,7 @@ on_every_ledger!(
     a_silent_worker_loses_its_job_and_its_late_result_is_refused,
     a_restarted_coordinator_goes_on_and_takes_what_workers_kept,
     a_run_submitted_alone_ends_the_others_and_cancelled_jobs_are_revoked,
+    a_ledger_has_one_store,
 );
 
 async fn two_workers_do_a_plan_and_the_next_run_does_nothing(place: Place) {
@@ -227,4 +229,22 @@ async fn a_run_submitted_alone_ends_the_others_and_cancelled_jobs_are_revoked(pl
     handle.cancel(&new).await.expect("a known run");
     handle.shutdown().await;
     assert_eq!(worker.await.expect("no panic"), 1);
+}
+
+async fn a_ledger_has_one_store(place: Place) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let begin = async |store: &str, identity: &str| {
+        let url = format!("file://{}", folder.path().join(store).display());
+        let served =
+            ServedStore { store: Objects::open(&url).expect("a store"), identity: identity.to_owned() };
+        Coordinator::start(Config { served: Some(served), ..config(&place) }).await
+    };
+    begin("a", "one").await.expect("the first store is taken").shutdown().await;
+    let error = begin("b", "two").await.err().expect("another store");
+    let text = error.to_string();
+    assert!(matches!(error, StartError::Ledger(LedgerError::OtherStore { .. })), "{text}");
+    assert!(text.contains("write one into") && text.contains("/b"), "{text}");
+    // It was moved, and coordinators without one of their own do not mind.
+    begin("b", "one").await.expect("the same store").shutdown().await;
+    start(&place).await.shutdown().await;
 }

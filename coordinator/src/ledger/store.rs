@@ -1,0 +1,21 @@
+//! Which store the results of a ledger lie in.
+
+use super::{Ledger, LedgerError};
+
+impl Ledger {
+    /// Ties the ledger to the store that says so of itself, and lies at `url`; the first one is kept, and another one
+    /// refused: half of the results would not be found.
+    pub(crate) async fn tie_to_store(&self, identity: &str, url: &str) -> Result<(), LedgerError> {
+        let failed = LedgerError::statement("note the store");
+        let query = sqlx::query("UPDATE counters SET store = $1 WHERE store IS NULL").bind(identity);
+        query.execute(&self.pool).await.map_err(&failed)?;
+        let kept: String = sqlx::query_scalar("SELECT store FROM counters")
+            .fetch_one(&self.pool)
+            .await
+            .map_err(LedgerError::statement("read which store it has"))?;
+        if kept == identity {
+            return Ok(());
+        }
+        Err(LedgerError::OtherStore { ledger: self.place.clone(), url: url.to_owned(), identity: kept })
+    }
+}
