@@ -36,8 +36,9 @@ impl Cluster {
         environment: Vec<(&'static str, String)>,
         more: &[&str],
     ) -> Self {
-        let options = ["--ledger", ledger, "--store", store, "--lease", LEASE_SECONDS];
-        let options: Vec<String> = options.iter().chain(more).map(ToString::to_string).collect();
+        let lease: &[&str] = if more.contains(&"--lease") { &[] } else { &["--lease", LEASE_SECONDS] };
+        let options = ["--ledger", ledger, "--store", store];
+        let options: Vec<String> = options.iter().chain(lease).chain(more).map(ToString::to_string).collect();
         let coordinator = listening("127.0.0.1:0", &environment, &options);
         let url = said_url(&coordinator).expect("it listens");
         Self { url, environment, options, coordinator }

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use planesweep_tests::{
-    Bench, Cluster, Postgres, Running, S3Server, courtyard, is_alive, run, send, wait_until,
+    Bench, Cluster, Postgres, Running, S3Server, courtyard, is_alive, plane_of_size, run, send, wait_until,
 };
 
 /// How long a state may take to come; far above what it ever takes.
@@ -167,6 +167,19 @@ fn of_two_coordinators_one_goes_and_the_workers_stay() {
     for worker in workers {
         let _ = worker.wait().expect_code(0);
     }
+}
+
+#[test]
+fn a_worker_that_is_sent_away_goes_when_no_other_coordinator_can_be_reached() {
+    let bench = Bench::new(|folder| drop(plane_of_size(folder, 4, 160, 128)));
+    let cluster = Cluster::start(&bench, &["--lease", "2"]);
+    let both = format!("http://127.0.0.1:9,{}", cluster.url());
+    let mut worker = Running::start(["worker", "--coordinator", &both, "--device", "analytic"]);
+    let _ = bench.submit("done", &cluster, &["--device", "analytic"]).wait().expect_code(0);
+    let _ = cluster.drain().wait().expect_code(0);
+    assert!(worker.is_running(), "it looks for the other first: {}", worker.stderr());
+    let gone = worker.wait().expect_code(0);
+    assert!(gone.stderr.contains("no other can be reached"), "{}", gone.stderr);
 }
 
 #[test]

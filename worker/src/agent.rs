@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 
 use planesweep_plan::{NUMERICS_VERSION, WorkerId};
 use planesweep_proto::{
-    Client, Credentials, Failure, Grant, JobAttempt, Order, Outcome, PROTOCOL_VERSION, Report, ReportReply,
-    Role, ServiceError, Slots, StorePlace, WorkerState,
+    Client, Code, Credentials, Failure, Grant, JobAttempt, Order, Outcome, PROTOCOL_VERSION, Report,
+    ReportReply, Role, ServiceError, Slots, StorePlace, WorkerState,
 };
 use thiserror::Error;
 use tokio::sync::mpsc;
@@ -225,9 +225,9 @@ impl Agent {
                 Ok(reply) => {
                     reconnect = RECONNECT.0;
                     self.lease_ends = Some(sent + reply.lease);
-                    let order = reply.order;
+                    let (order, lease) = (reply.order, reply.lease);
                     let brought_something = self.apply(reply);
-                    let verdict = self.orders.hear(coordinator, order);
+                    let verdict = self.orders.hear(coordinator, order, lease, Instant::now());
                     if verdict == Verdict::Leave && self.state == WorkerState::Ready {
                         self.take_leave(coordinator).await;
                         continue;
@@ -250,6 +250,12 @@ impl Agent {
                     }
                 }
                 Err(error) if error.is_retryable() => {
+                    if error.code != Code::Unavailable {
+                        self.orders.hear_of_one();
+                    } else if self.orders.is_forsaken(Instant::now()) {
+                        tracing::warn!("one coordinator goes and no other can be reached, going too");
+                        return Ok(());
+                    }
                     tracing::warn!(%error, "cannot report to the coordinator, trying again");
                     self.end_lease_if_over();
                     if self.state != WorkerState::Ready {
