@@ -20,7 +20,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::device::{BackendFactory, Device};
 use crate::disk_cache::DiskCache;
-use crate::exchange::{Exchange, ExchangeConfig, ExchangeError};
+use crate::exchange::{Exchange, ExchangeConfig, ExchangeError, Trust};
 use crate::failure::JobError;
 use crate::fault_point::{FaultPoint, code_version, pass};
 use crate::held::Held;
@@ -108,7 +108,7 @@ pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result
         &config.id,
         &config.host,
         config.role,
-        config.credentials,
+        Trust::of(&config.coordinator, config.credentials),
         Arc::clone(&maps),
         config.cache_bytes,
     )

@@ -8,6 +8,8 @@ use std::io::{BufRead, BufReader, Write};
 use std::process::{ChildStdin, ChildStdout, Command, Stdio};
 use std::time::Instant;
 
+use planesweep_proto::Credentials;
+
 use super::conformance::{depth_map, shared_memory};
 use super::*;
 use crate::blob::{depth_map_bytes, encode_depth_map};
@@ -99,7 +101,7 @@ async fn shared_memory_against_streams() {
     let answers = BufReader::new(child.stdout.take().expect("piped")).lines();
     let mut sender = Sender { orders: child.stdin.take().expect("piped"), answers };
     let address = Some(sender.answer(|word| word.starts_with("http://")));
-    let peers = Peers::new(Credentials::default());
+    let peers = Peers::new(Trust::of("", Credentials::default()));
     peers.learn(&[Peer { worker: WorkerId("sender".into()), endpoint: Endpoint { address, inbox: None } }]);
 
     for (width, height, size) in SIZES {

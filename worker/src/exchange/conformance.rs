@@ -4,7 +4,7 @@ use std::fs::File;
 use std::net::{IpAddr, Ipv4Addr};
 
 use nalgebra::{Point3, Vector3};
-use planesweep_proto::{Code, PeerClient, first_chunk, wire};
+use planesweep_proto::{Code, Credentials, PeerClient, first_chunk, wire};
 use planesweep_scene::{Camera, DepthMap, Intrinsics, Pose, Raster};
 use tempfile::TempDir;
 use tonic::codegen::BoxStream;
@@ -49,8 +49,8 @@ impl Party {
         let id = WorkerId(format!("{name}-{}-{number}", std::process::id()));
         let maps = Arc::new(Maps::new(64 << 20));
         let config = ExchangeConfig { listen: LOOPBACK, tls: None, shared_memory };
-        let credentials = Credentials::of_token(token);
-        let exchange = Exchange::start(&config, &id, "host", role, credentials, Arc::clone(&maps), INBOX_BYTES);
+        let trust = Trust::of("http://127.0.0.1:7070", Credentials::of_token(token));
+        let exchange = Exchange::start(&config, &id, "host", role, trust, Arc::clone(&maps), INBOX_BYTES);
         Self { exchange: exchange.await.expect("loopback is there"), id, maps }
     }
 

@@ -32,12 +32,13 @@ use std::time::Duration;
 
 use bytes::{BufMut, Bytes};
 use planesweep_plan::{BlobKey, WorkerId};
-use planesweep_proto::{Credentials, Endpoint, Peer, Produced, Role, ServerTls, ServiceError, TlsError, Way};
+use planesweep_proto::{Endpoint, Peer, Produced, Role, ServerTls, ServiceError, TlsError, Way};
 use thiserror::Error;
 
 use loan::Loan;
 use outgoing::Outgoing;
-use peers::Peers;
+pub(crate) use peers::Trust;
+use peers::{Peers, speaks_tls};
 use server::{Served, start_serving};
 use shared_memory::{Inbox, Outbox, SharedMemoryError};
 
@@ -65,7 +66,7 @@ impl ExchangeConfig {
     /// Checks that a worker of this coordinator, or of these, may serve its maps so.
     pub(crate) fn check(&self, coordinator: &str) -> Result<(), ExchangeError> {
         let is_guarded = self.tls.is_some() || self.listen.ip().is_loopback();
-        if coordinator.contains("https://") && !is_guarded {
+        if speaks_tls(coordinator) && !is_guarded {
             return Err(ExchangeError::NoTls { listen: self.listen });
         }
         Ok(())
@@ -123,14 +124,15 @@ impl Exchange {
         worker: &WorkerId,
         host: &str,
         role: Role,
-        credentials: Credentials,
+        trust: Trust,
         maps: Arc<Maps>,
         inbox_bytes: u64,
     ) -> Result<Self, ExchangeError> {
         let has_inbox = config.shared_memory && role == Role::Fuse;
         let inbox = if has_inbox { open_inbox(worker.0.clone(), inbox_bytes).await } else { None };
-        let served = start_serving(config, host, credentials.token.as_deref(), maps, inbox.clone()).await?;
-        let peers = Arc::new(Peers::new(credentials));
+        let served =
+            start_serving(config, host, trust.credentials.token.as_deref(), maps, inbox.clone()).await?;
+        let peers = Arc::new(Peers::new(trust));
         let outgoing = Outgoing::new(config.shared_memory && !has_inbox, Arc::clone(&peers));
         Ok(Self { inbox, outgoing, peers, served })
     }
