@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use planesweep_mvsnet::Refinement;
 use planesweep_tests::{
-    Bench, Cluster, Running, files_below, is_frozen, plane, seeded_weights_with, send, wait_until,
+    Bench, Cluster, Running, files_below, is_frozen, plane, run, seeded_weights_with, send, wait_until,
 };
 use serde_json::{Value, json};
 
@@ -124,6 +124,13 @@ fn a_job_that_kills_every_worker_is_quarantined_and_named_and_the_rest_is_finish
         let read = |out: &str| bench.read(&format!("{out}/depth/{view:08}.pfm"));
         assert!(read("calm") == read("struck"), "view {view} differs");
     }
+    // Its cloud is that of the undisturbed maps without the lost one.
+    std::fs::remove_file(bench.path("calm/depth/00000002.pfm")).expect("it was there");
+    let (calm, lacking) = (bench.path("calm"), bench.path("lacking.ply"));
+    let _ = run(["fuse", &calm, "-o", &lacking, "--min-confidence", "0", "--min-views", "1"]).expect_code(3);
+    let lacking = bench.read("lacking.ply");
+    assert!(lacking.len() > 10_000 && lacking == bench.read("struck/cloud.ply"), "the clouds differ");
+    assert!(lacking != bench.read("calm/cloud.ply"), "the view is not missed");
 
     // Submitted again, where nothing kills, it is done after all.
     drop(workers);
