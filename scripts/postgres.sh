@@ -3,11 +3,11 @@
 # folder is made the first time. Tests start it.
 #
 #   scripts/postgres.sh FOLDER PORT        postgres://planesweep@127.0.0.1:PORT/postgres
+#   scripts/postgres.sh --binaries         says in which folder its programs are, and does no more
 #
 # Takes Debian's package, and installs it when it is missing and root asks. The server refuses to run as root, so
 # it then runs as the package's user. Exit code 77: there is no PostgreSQL and none can be installed.
 set -euo pipefail
-folder=$1 port=$2
 
 binaries() { ls -d /usr/lib/postgresql/*/bin 2>/dev/null | sort -V | tail -n 1; }
 if [ -z "$(binaries)" ] && [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
@@ -16,6 +16,11 @@ if [ -z "$(binaries)" ] && [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; 
 fi
 bin=$(binaries)
 [ -n "$bin" ] || { echo "no PostgreSQL is installed" >&2; exit 77; }
+if [ "$1" = --binaries ]; then
+    echo "$bin"
+    exit
+fi
+folder=$1 port=$2
 
 as=()
 if [ "$(id -u)" = 0 ]; then

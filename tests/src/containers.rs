@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
 use serde_json::Value;
@@ -77,21 +77,18 @@ impl Containers {
 
     /// Makes the image of the program under test; `false`, and a line on stderr, where that is not possible.
     pub fn make_image(&self, test: &str, image: &str) -> bool {
-        let mut command = Command::new(script("docker_image.sh"));
-        command.arg(program()).arg(image);
-        if let Some(host) = self.host() {
-            command.env("DOCKER_HOST", host);
-        }
-        let made = command.output().expect("a script starts");
-        if unavailable(test, &made) {
-            return false;
-        }
-        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-        true
+        let made = self.script("docker_image.sh").arg(program()).arg(image).output();
+        is_made(test, &made.expect("a script starts"))
     }
 
-    fn host(&self) -> Option<String> {
-        self.socket.as_ref().map(|socket| format!("unix://{}", socket.display()))
+    /// A script of the project that uses this engine.
+    pub(crate) fn script(&self, name: &str) -> Command {
+        with_engine(Command::new(script(name)), self.socket.as_deref())
+    }
+
+    /// What the names of this test's containers and networks begin with.
+    pub(crate) fn prefix(&self) -> &str {
+        &self.prefix
     }
 
     /// Runs `docker` with these arguments, which must succeed; what it said on both streams.
@@ -128,11 +125,17 @@ impl Containers {
         full
     }
 
+    /// What `docker inspect` says of a container.
+    #[track_caller]
+    pub fn inspect(&self, container: &str) -> Value {
+        let said = self.docker(&["inspect", "--format", "{{json .}}", container]);
+        serde_json::from_str(&said).unwrap_or_else(|error| panic!("{error}: {said}"))
+    }
+
     /// A container's state: the part of `docker inspect` of that name.
     #[track_caller]
     pub fn state(&self, container: &str) -> Value {
-        let said = self.docker(&["inspect", "--format", "{{json .State}}", container]);
-        serde_json::from_str(&said).unwrap_or_else(|error| panic!("no state: {error}: {said}"))
+        self.inspect(container)["State"].take()
     }
 
     /// What a container has printed.
@@ -161,8 +164,20 @@ impl Drop for Containers {
     }
 }
 
+/// Whether a script made something; `false`, and a line on stderr, where it cannot be made.
+pub(crate) fn is_made(test: &str, output: &Output) -> bool {
+    if unavailable(test, output) {
+        return false;
+    }
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    true
+}
+
 fn docker(socket: Option<&Path>) -> Command {
-    let mut command = Command::new("docker");
+    with_engine(Command::new("docker"), socket)
+}
+
+fn with_engine(mut command: Command, socket: Option<&Path>) -> Command {
     if let Some(socket) = socket {
         command.env("DOCKER_HOST", format!("unix://{}", socket.display()));
     }

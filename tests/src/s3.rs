@@ -1,4 +1,4 @@
-//! A server of the S3 protocol in the test's process.
+//! A server of the S3 protocol.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::time::Duration;
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use hyper_util::server::conn::auto::Builder;
 use s3s::auth::SimpleAuth;
-use s3s::service::{S3Service, S3ServiceBuilder};
+use s3s::service::S3ServiceBuilder;
 use s3s_fs::FileSystem;
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
@@ -18,7 +18,7 @@ const BUCKET: &str = "bucket";
 /// How long open connections may take to break when the server goes.
 const CLOSING: Duration = Duration::from_secs(5);
 
-/// A server with one bucket in a folder. It can go away and come back at the same address.
+/// A server in the test's process with one bucket in a folder. It can go away and come back at the same address.
 pub struct S3Server {
     folder: PathBuf,
     address: SocketAddr,
@@ -64,13 +64,10 @@ impl S3Server {
 
     /// Serves again.
     pub fn come_back(&mut self) {
-        let mut builder = S3ServiceBuilder::new(FileSystem::new(&self.folder).expect("a folder"));
-        builder.set_auth(SimpleAuth::from_single(KEYS.0, KEYS.1));
-        let service = builder.build();
         let runtime = Runtime::new().expect("a runtime");
         let listener = runtime.block_on(TcpListener::bind(self.address)).expect("a free port");
         self.address = listener.local_addr().expect("it is bound");
-        runtime.spawn(serve(listener, service));
+        runtime.spawn(serve_s3(self.folder.clone(), KEYS.0.to_owned(), KEYS.1.to_owned(), listener));
         self.runtime = Some(runtime);
     }
 }
@@ -81,7 +78,11 @@ impl Drop for S3Server {
     }
 }
 
-async fn serve(listener: TcpListener, service: S3Service) {
+/// Serves the folders in this one as buckets, to whoever has the keys, without end.
+pub async fn serve_s3(folder: PathBuf, access_key: String, secret_key: String, listener: TcpListener) {
+    let mut builder = S3ServiceBuilder::new(FileSystem::new(folder).expect("a folder"));
+    builder.set_auth(SimpleAuth::from_single(access_key, secret_key));
+    let service = builder.build();
     while let Ok((socket, _)) = listener.accept().await {
         let service = service.clone();
         tokio::spawn(async move {
