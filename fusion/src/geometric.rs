@@ -28,44 +28,44 @@ pub(crate) struct Neighbour<'a> {
     pub color: &'a [[u8; 3]],
     /// Columns and rows; 0 where the map is too large to be read.
     pub size: [i32; 2],
-    /// From its pixels to the reference.
-    pub back: Back,
+    /// From one of its pixels to about where the next row of the reference lies: a row, as far as that goes.
+    pub next_row: isize,
     /// How it competes with the reference for a surface.
     pub rival: Rival,
     there: Transfer,
-    back_exactly: Transfer,
+    back: Transfer,
 }
 
 impl<'a> Neighbour<'a> {
     /// Prepares `map` to be asked about pixels of `reference`.
     pub fn new(reference: &Camera, map: &'a DepthMap) -> Self {
         let there = Transfer::between(reference, &map.camera);
-        let back_exactly = Transfer::between(&map.camera, reference);
         let (width, height) = (map.width(), map.height());
         let is_small = width < MAX_SIDE && height < MAX_SIDE && map.depth.values().len() < MAX_PIXELS;
+        let next_row = if there.matrix[(1, 1)] < 0.0 { -(width as isize) } else { width as isize };
         Self {
             map,
             depth: map.depth.values(),
             confidence: map.confidence.values(),
             color: map.color.values(),
             size: if is_small { [width as i32, height as i32] } else { [0; 2] },
-            back: Back::new(&back_exactly),
+            next_row,
             rival: Rival::new(&map.camera, reference),
             there,
-            back_exactly,
+            back: Transfer::between(&map.camera, reference),
         }
     }
 
     /// The projection of row `y` of the reference into the neighbour.
     #[inline(always)]
     pub fn row_transfer(&self, y: usize) -> RowTransfer {
-        self.there.of_row(y)
+        self.there.of_row(y, &self.back)
     }
 
     /// The projection of row `y` of the neighbour into the reference.
     #[inline(always)]
     pub fn row_back(&self, y: usize) -> RowTransfer {
-        self.back_exactly.of_row(y)
+        self.back.of_row(y, &self.there)
     }
 }
 
@@ -76,6 +76,10 @@ pub(crate) struct RowTransfer {
     pub along: [f32; 3],
     pub start: [f32; 3],
     pub shift: [f32; 3],
+    /// Column and depth of the other camera's centre as a homogeneous pixel `(x, y, z)` of this camera.
+    pub centre: [f32; 2],
+    /// How far that lies beside the row, `y - row z`.
+    pub centre_beside_row: f32,
 }
 
 impl RowTransfer {
@@ -83,29 +87,12 @@ impl RowTransfer {
     /// are [`OUTSIDE`] when it lies behind.
     #[inline(always)]
     pub fn project(&self, x: f32, d: f32) -> (f32, f32, f32) {
-        let Self { along, start, shift } = self;
+        let Self { along, start, shift, .. } = self;
         let z = (along[2] * x + start[2]) * d + shift[2];
         let scale = 1.0 / z;
         let u = ((along[0] * x + start[0]) * d + shift[0]) * scale;
         let v = ((along[1] * x + start[1]) * d + shift[1]) * scale;
         (if z > 0.0 { u } else { OUTSIDE }, if z > 0.0 { v } else { OUTSIDE }, z)
-    }
-}
-
-/// From a pixel of the neighbour to the reference, in `f32`: the homogeneous pixel of `(u, v)` with depth d is
-/// `matrix (u, v, 1)^T d + shift`.
-pub(crate) struct Back {
-    /// By rows.
-    pub matrix: [[f32; 3]; 3],
-    pub shift: [f32; 3],
-}
-
-impl Back {
-    fn new(transfer: &Transfer) -> Self {
-        Self {
-            matrix: transfer.matrix.transpose().map(|m| m as f32).into(),
-            shift: transfer.vector.map(|m| m as f32).into(),
-        }
     }
 }
 
@@ -126,12 +113,16 @@ impl Transfer {
         }
     }
 
-    fn of_row(&self, y: usize) -> RowTransfer {
+    /// Of row `y`, with the transfer `back`.
+    fn of_row(&self, y: usize, back: &Self) -> RowTransfer {
         let Self { matrix, vector } = self;
+        let centre = &back.vector;
         RowTransfer {
             along: matrix.column(0).map(|m| m as f32).into(),
             start: (matrix.column(1) * y as f64 + matrix.column(2)).map(|m| m as f32).into(),
             shift: vector.map(|m| m as f32).into(),
+            centre: [centre.x as f32, centre.z as f32],
+            centre_beside_row: (centre.y - y as f64 * centre.z) as f32,
         }
     }
 }

@@ -16,35 +16,30 @@ use rayon::prelude::*;
 use crate::filter::FilteredMap;
 
 /// Relative difference below which footprints are equal, so that both views see them so.
-pub(crate) const EQUAL_FOOTPRINTS: f32 = 1e-4;
+const EQUAL_FOOTPRINTS: f64 = 1e-4;
 
 /// How a neighbour competes with the reference for a place: the smaller footprint wins, width of a pixel times
 /// depth; of equal ones the first by the coordinates of the camera centres, which stay the same when views are
 /// numbered anew. Of two views in different places one wins.
 pub(crate) struct Rival {
-    /// Width of a pixel at depth 1.
-    pub pixel_width: f32,
-    /// Of the reference.
-    pub reference_pixel_width: f32,
-    /// Whether it wins where footprints are equal.
-    pub wins_ties: bool,
+    /// It wins where its depth is less than the reference's times this.
+    pub wins_below: f32,
 }
 
 impl Rival {
     pub fn new(neighbour: &Camera, reference: &Camera) -> Self {
         let pixel_width = |camera: &Camera| {
             let k = &camera.intrinsics;
-            (1.0 / (k.fx * k.fy).sqrt()) as f32
+            1.0 / (k.fx * k.fy).sqrt()
         };
         let centre = |camera: &Camera| {
             let centre = camera.pose.centre();
             (centre.x, centre.y, centre.z)
         };
-        Self {
-            pixel_width: pixel_width(neighbour),
-            reference_pixel_width: pixel_width(reference),
-            wins_ties: centre(neighbour) < centre(reference),
-        }
+        let wins_ties = centre(neighbour) < centre(reference);
+        let tolerance = if wins_ties { EQUAL_FOOTPRINTS } else { -EQUAL_FOOTPRINTS };
+        let wins_below = pixel_width(reference) / pixel_width(neighbour) * (1.0 + tolerance);
+        Self { wins_below: wins_below as f32 }
     }
 }
 

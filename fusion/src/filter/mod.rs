@@ -65,7 +65,7 @@ pub fn filter(reference: &DepthMap, neighbours: &[&DepthMap], options: &FilterOp
             Some(Candidates::new(reference, &neighbours, options))
         }
     };
-    let level = Level::detect(reference, &neighbours);
+    let level = Level::detect();
     let input = Input { reference, neighbours: &neighbours, options, level };
     let mut depth = Raster::filled(width, height, 0.0);
     let mut color = Raster::filled(width, height, [0; 3]);

@@ -312,6 +312,15 @@ fn the_number_of_threads_changes_no_bit() {
     }
 }
 
+/// All that this processor has but the widest.
+fn levels() -> Vec<Level> {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+        return vec![Level::Portable, Level::Avx2];
+    }
+    vec![Level::Portable]
+}
+
 #[test]
 fn wider_registers_change_no_bit() {
     let noise: Vec<_> = (0..991).map(|i| ((i as f32 * 0.3).sin(), 0.75 + (i as f32).sin() / 4.0)).collect();
@@ -327,10 +336,9 @@ fn wider_registers_change_no_bit() {
         let dispatched = filter_first(&maps, &options);
         let candidates = matches!(method, FusionMethod::Visibility | FusionMethod::VisibilityConfidence)
             .then(|| Candidates::new(&maps[0], &neighbours, &options));
-        let level = Level::Portable;
-        let input = Input { reference: &maps[0], neighbours: &neighbours, options: &options, level };
         let mut row = RowFilter::default();
-        for y in 0..43 {
+        for (level, y) in levels().into_iter().flat_map(|level| (0..43).map(move |y| (level, y))) {
+            let input = Input { reference: &maps[0], neighbours: &neighbours, options: &options, level };
             let (mut depth, mut color, mut views) = ([0.0; 61], [[0; 3]; 61], [0; 61]);
             let (mut confidence, mut agreeing, mut owns) = ([0; 61], [0; 61], [false; 61]);
             let mut out = OutputRow {

@@ -2,114 +2,242 @@
 //!
 //! A pixel p of the reference is projected with its depth into the neighbour, the neighbour's depth
 //! there is projected back, and both must come close: to p in the image, to its depth in space.
+//!
+//! The way back needs no camera. The hypothesis, as a homogeneous pixel P = d (x, y, 1) of the reference, and
+//! what the neighbour sees there lie on a line of sight of the neighbour, at the depths z and s. So the latter is
+//! P + q (C - P), with C the neighbour's centre and q = 1 - s / z.
 #![allow(unsafe_op_in_unsafe_fn, reason = "the contract of each function covers its body as a whole")]
 
-use planesweep_scene::Raster;
-
-use super::Answer;
-use super::lanes::{LANES, Lanes, Portable};
-use crate::dynamic;
-use crate::geometric::{Back, Neighbour, RowTransfer};
+use super::lanes::{LANES, Lanes, Pairs, pair_of_lane};
+use crate::dynamic::level;
+use crate::geometric::{Neighbour, RowTransfer};
 use crate::options::{DepthSampling, FilterOptions, FusionMethod};
 
-/// Asks a neighbour about the hypotheses in columns `x` of row `y` with depths `d`.
+/// Where a neighbour sees some hypotheses, and what it has there: the first two steps.
+#[derive(Clone, Copy, Default)]
+#[repr(align(64))]
+pub(super) struct Place {
+    /// Depth of the hypothesis in the neighbour, and its inverse.
+    pub z: [f32; LANES],
+    inverse: [f32; LANES],
+    /// The upper left of the four pixels around, and how far the place lies from it.
+    corner: [i32; LANES],
+    fx: [f32; LANES],
+    fy: [f32; LANES],
+    /// The depths of the two upper and the two lower ones of the four pixels.
+    upper: Pairs,
+    lower: Pairs,
+    /// Lanes of which all four pixels are of the map, lane k as bit k, and lanes of which some are.
+    inside: u32,
+    border: u32,
+}
+
+/// What a neighbour makes of some hypotheses, and its pixels there: the next two steps.
+#[derive(Clone, Copy, Default)]
+#[repr(align(64))]
+pub(crate) struct Pixel {
+    /// Depth of the reference that the neighbour's depth amounts to; 0 where it disagrees.
+    pub depth: [f32; LANES],
+    /// With [`FusionMethod::Dynamic`], the least n whose thresholds it meets.
+    pub level: [f32; LANES],
+    /// The neighbour's nearest pixel.
+    pub index: [i32; LANES],
+    /// Four bytes with its colour are read from here on; they move down by so many bits.
+    pub color_at: [i32; LANES],
+    pub color_shift: [i32; LANES],
+    pub color: [i32; LANES],
+    pub confidence: [f32; LANES],
+}
+
+/// Projects the hypotheses in columns `x` of a row with depths `d` into a neighbour.
 ///
 /// # Safety
-/// As [`Lanes`]; with vector instructions, the neighbour has two pixels or more.
+/// As [`Lanes`].
 #[inline(always)]
-pub(super) unsafe fn ask<L: Lanes>(
+pub(super) unsafe fn project<L: Lanes>(
     neighbour: &Neighbour<'_>,
     transfer: &RowTransfer,
-    options: &FilterOptions,
-    (x, y, d): (L::F, f32, L::F),
-    answer: &mut Answer,
+    (x, d): (L::F, L::F),
+    place: &mut Place,
 ) {
     let zero = L::splat(0.0);
-    let RowTransfer { along, start, shift } = transfer;
-    let from_pixel = [
-        L::add(L::mul(L::splat(along[0]), x), L::splat(start[0])),
-        L::add(L::mul(L::splat(along[1]), x), L::splat(start[1])),
-        L::add(L::mul(L::splat(along[2]), x), L::splat(start[2])),
-    ];
-    let [u, v, z] = transferred::<L>(from_pixel, d, shift);
+    let z = transferred::<L>(transfer, 2, x, d);
+    let inverse = L::div(L::splat(1.0), z);
+    let u = L::mul(transferred::<L>(transfer, 0, x, d), inverse);
+    let v = L::mul(transferred::<L>(transfer, 1, x, d), inverse);
     // All four pixels around are pixels of the map, or some are. At 0 exactly it is the border's turn.
     let in_front = L::less(zero, z);
     let inside = L::and(in_front, within::<L>([u, v], 0.0, neighbour.size, -1.0));
-    let seen = if L::bits(inside) == (1 << LANES) - 1 {
-        sample::<L>(neighbour, options, [u, v], inside)
-    } else {
+    let (column, row) = (L::truncate(u), L::truncate(v));
+    let corner = L::add_i(L::mul_i(row, L::splat_i(neighbour.size[0])), column);
+    let (mut fx, mut fy) = (L::sub(u, L::to_float(column)), L::sub(v, L::to_float(row)));
+    place.inside = L::bits(inside);
+    place.border = 0;
+    if place.inside != (1 << LANES) - 1 {
         let touching = L::and(in_front, within::<L>([u, v], -1.0, neighbour.size, 0.0));
-        if L::bits(touching) == 0 {
-            answer.depth = [0.0; LANES];
-            return;
+        place.border = L::bits(L::but_not(touching, inside));
+        // The border's turn comes later; what is no number agrees with nothing.
+        fx = L::select(inside, fx, L::select(touching, u, L::splat(f32::NAN)));
+        fy = L::select(inside, fy, v);
+    }
+    place.z = L::store(z);
+    place.inverse = L::store(inverse);
+    place.corner = L::store_i(L::only_i(inside, corner));
+    (place.fx, place.fy) = (L::store(fx), L::store(fy));
+}
+
+/// Fetches the depths of a neighbour at the places of hypotheses.
+///
+/// # Safety
+/// As [`Lanes`]; `place` comes from [`project`] into this neighbour.
+#[inline(always)]
+pub(super) unsafe fn fetch_depths<L: Lanes>(neighbour: &Neighbour<'_>, place: &mut Place) {
+    if place.inside != 0 {
+        let columns = neighbour.size[0] as usize;
+        let (from, to) = (neighbour.depth.as_ptr(), (&raw mut place.upper, &raw mut place.lower));
+        for k in 0..LANES {
+            // SAFETY: the corner is inside, so the next pixel and those below are of the map; or it is 0, and the map
+            // has two rows and columns, since some lane is inside. Pairs hold as many as there are lanes.
+            let upper = from.add(place.corner[k] as u32 as usize);
+            copy_pair(upper, to.0.cast::<u64>().add(pair_of_lane(k)));
+            copy_pair(upper.add(columns), to.1.cast::<u64>().add(pair_of_lane(k)));
         }
-        let sampled = sample::<L>(neighbour, options, [u, v], inside);
-        let border = L::but_not(touching, inside);
-        if L::bits(border) == 0 {
-            sampled
-        } else {
-            let at_border =
-                sample_border(&neighbour.map.depth, options, L::store(u), L::store(v), L::bits(border));
-            L::select(border, L::load(&at_border), sampled)
+        // The next row of the reference will ask for what lies in the next row here, which the processor does
+        // not foresee for all neighbours by itself: the band is fetched that it will lie in.
+        let band = place.corner[0] as isize + 2 * neighbour.next_row;
+        for ahead in [band, band + LANES as isize] {
+            L::prefetch(from.wrapping_offset(ahead + neighbour.next_row));
+            L::prefetch(neighbour.confidence.as_ptr().wrapping_offset(ahead));
+            L::prefetch(neighbour.color.as_ptr().wrapping_offset(ahead));
         }
+    }
+    if place.border != 0 {
+        fetch_border(neighbour, place);
+    }
+}
+
+/// Volatile, lest the compiler make hardware's gathers of many copies: they take several times as long.
+///
+/// # Safety
+/// Two floats can be read, and written.
+#[inline(always)]
+unsafe fn copy_pair(from: *const f32, to: *mut u64) {
+    to.write_volatile(from.cast::<u64>().read_unaligned());
+}
+
+/// The same for lanes at the border: pixels outside count as 0.
+#[cold]
+fn fetch_border(neighbour: &Neighbour<'_>, place: &mut Place) {
+    for k in (0..LANES).filter(|k| place.border >> k & 1 == 1) {
+        let (x, y) = (place.fx[k].floor(), place.fy[k].floor());
+        (place.fx[k], place.fy[k]) = (place.fx[k] - x, place.fy[k] - y);
+        // A negative index wraps to one that no raster has.
+        let depth = |dx: i64, dy: i64| {
+            neighbour.map.depth.get((x as i64 + dx) as usize, (y as i64 + dy) as usize).unwrap_or(0.0)
+        };
+        place.upper.0[pair_of_lane(k)] = [depth(0, 0), depth(1, 0)];
+        place.lower.0[pair_of_lane(k)] = [depth(0, 1), depth(1, 1)];
+        // The corner from which the nearest pixel of the map is reached as from any other.
+        let [columns, rows] = neighbour.size;
+        let (right, down) = (i32::from(place.fx[k] > 0.5), i32::from(place.fy[k] > 0.5));
+        let nearest = |position: i32, size: i32| position.min(size - 1).max(0);
+        let pixel = nearest(y as i32 + down, rows) * columns + nearest(x as i32 + right, columns);
+        place.corner[k] = pixel - right - down * columns;
+    }
+}
+
+/// Compares what a neighbour sees with the hypotheses in columns `x` with depths `d`.
+///
+/// # Safety
+/// As [`Lanes`].
+#[inline(always)]
+pub(super) unsafe fn compare<L: Lanes>(
+    neighbour: &Neighbour<'_>,
+    transfer: &RowTransfer,
+    options: &FilterOptions,
+    (x, d): (L::F, L::F),
+    place: &Place,
+    pixel: &mut Pixel,
+) {
+    let (zero, half) = (L::splat(0.0), L::splat(0.5));
+    let ((a, b), (c, e)) = (L::load_pairs(&place.upper), L::load_pairs(&place.lower));
+    let (fx, fy) = (L::load(&place.fx), L::load(&place.fy));
+    let seen = match options.sampling {
+        DepthSampling::Bilinear => bilinear::<L>([a, b, c, e], fx, fy),
+        DepthSampling::Continuous => continuous::<L>([a, b, c, e], fx, fy, options.max_relative_depth),
     };
-    let Back { matrix, shift } = &neighbour.back;
-    let from_pixel =
-        [combined::<L>(&matrix[0], u, v), combined::<L>(&matrix[1], u, v), combined::<L>(&matrix[2], u, v)];
-    let [back_x, back_y, depth] = transferred::<L>(from_pixel, seen, shift);
-    let (dx, dy) = (L::sub(back_x, x), L::sub(back_y, L::splat(y)));
-    let squared = L::add(L::mul(dx, dx), L::mul(dy, dy));
-    let pixel = options.network_pixel;
-    let difference = L::abs(L::sub(depth, d));
+    let q = L::mul_sub_from(seen, L::load(&place.inverse), L::splat(1.0));
+    let [centre_x, centre_z] = transfer.centre;
+    let difference = L::mul(q, L::sub(L::splat(centre_z), d));
+    let depth = L::add(d, difference);
+    // Pixels of the reference, times its depth there.
+    let across = L::mul(q, L::mul_sub_from(x, L::splat(centre_z), L::splat(centre_x)));
+    let along = L::mul(q, L::splat(transfer.centre_beside_row));
+    let squared = L::mul_add(across, across, L::mul(along, along));
     let in_front = L::and(L::less(zero, depth), L::less(zero, seen));
     let agrees = if options.method == FusionMethod::Dynamic {
-        answer.level = L::store(dynamic::level::<L>(
-            L::mul(squared, L::splat(1.0 / (pixel * pixel))),
-            L::div(difference, d),
-        ));
+        let most = L::mul(L::splat(options.network_pixel), depth);
+        let squared = L::div(squared, L::mul(most, most));
+        pixel.level = L::store(level::<L>(squared, L::div(L::abs(difference), d)));
         in_front
     } else {
-        let most = options.max_reprojection_px * pixel;
-        let near = L::less(squared, L::splat(most * most));
-        let alike = L::less(difference, L::mul(L::splat(options.max_relative_depth), d));
+        let most = L::mul(L::splat(options.max_reprojection_px * options.network_pixel), depth);
+        let near = L::less(squared, L::mul(most, most));
+        let alike = L::less(L::abs(difference), L::mul(L::splat(options.max_relative_depth), d));
         L::and(in_front, L::and(near, alike))
     };
-    answer.depth = L::store(L::only(agrees, depth));
-    if L::bits(agrees) == 0 {
-        return;
+    pixel.depth = L::store(L::only(agrees, depth));
+    let columns = L::splat_i(neighbour.size[0]);
+    let right = L::only_i(L::less(half, fx), L::splat_i(1));
+    let down = L::only_i(L::less(half, fy), columns);
+    // Of lanes that disagree nothing will be asked.
+    let index = L::only_i(agrees, L::add_i(L::add_i(L::load_i(&place.corner), right), down));
+    let color = L::add_i(L::add_i(index, index), index);
+    // Four bytes are read: those of the last pixel with the one before.
+    let color_at = L::min_i(color, L::splat_i(3 * neighbour.color.len() as i32 - 4));
+    let beyond = L::sub_i(color, color_at);
+    pixel.index = L::store_i(index);
+    pixel.color_at = L::store_i(color_at);
+    pixel.color_shift = L::store_i(L::mul_i(beyond, L::splat_i(8)));
+}
+
+/// Fetches colours and confidences of a neighbour's nearest pixels.
+///
+/// # Safety
+/// `pixel` comes from [`compare`] with this neighbour.
+#[inline(always)]
+#[expect(clippy::cast_ptr_alignment, reason = "they are read as what they are")]
+pub(super) unsafe fn fetch_pixels(neighbour: &Neighbour<'_>, pixel: &mut Pixel) {
+    if neighbour.color.len() < 2 {
+        return fetch_only_pixel(neighbour, pixel);
     }
-    answer.z = L::store(z);
-    // Whether it agrees or not, so that the processor need not wait for that.
-    let (column, row) = (nearest::<L>(u, neighbour.size[0]), nearest::<L>(v, neighbour.size[1]));
-    let pixel = L::add_i(L::mul_i(row, L::splat_i(neighbour.size[0])), column);
-    answer.color = L::store_i(L::gather_rgb(neighbour.color, pixel));
-    answer.confidence = L::store(L::gather(neighbour.confidence, pixel));
+    let (color, confidence) = (neighbour.color.as_ptr().cast::<u8>(), neighbour.confidence.as_ptr());
+    for k in 0..LANES {
+        // SAFETY: the index is a pixel of the map, and its colour is among four bytes that are, for there are two
+        // pixels. Volatile as pairs are.
+        let color = color.add(pixel.color_at[k] as u32 as usize).cast::<i32>();
+        (&raw mut pixel.color[k]).write_volatile(color.read_unaligned());
+        let confidence = confidence.add(pixel.index[k] as u32 as usize);
+        (&raw mut pixel.confidence[k]).write_volatile(confidence.read());
+    }
+}
+
+/// The same of a map with a single pixel: it has one byte less than are read.
+#[cold]
+fn fetch_only_pixel(neighbour: &Neighbour<'_>, pixel: &mut Pixel) {
+    let [r, g, b] = neighbour.color.first().copied().unwrap_or_default();
+    pixel.color = [i32::from_le_bytes([0, r, g, b]); LANES];
+    pixel.confidence = [neighbour.confidence.first().copied().unwrap_or_default(); LANES];
 }
 
 // Closures are not compiled for the instructions of the function around them; these are.
 
-/// Column, row and depth of a homogeneous pixel at depth 1, moved to depth `d`, in the other camera.
+/// A coordinate of the homogeneous pixel in the neighbour.
 #[inline(always)]
-unsafe fn transferred<L: Lanes>(at_depth_1: [L::F; 3], d: L::F, shift: &[f32; 3]) -> [L::F; 3] {
-    let [x, y, z] = at_depth_1;
-    let z = L::add(L::mul(z, d), L::splat(shift[2]));
-    let scale = L::div(L::splat(1.0), z);
-    let u = L::mul(L::add(L::mul(x, d), L::splat(shift[0])), scale);
-    let v = L::mul(L::add(L::mul(y, d), L::splat(shift[1])), scale);
-    [u, v, z]
-}
-
-/// A row of a matrix times `(u, v, 1)`.
-#[inline(always)]
-unsafe fn combined<L: Lanes>([a, b, c]: &[f32; 3], u: L::F, v: L::F) -> L::F {
-    L::add(L::add(L::mul(L::splat(*a), u), L::mul(L::splat(*b), v)), L::splat(*c))
-}
-
-/// The pixel that a column or row lies in, or the nearest of the map.
-#[inline(always)]
-unsafe fn nearest<L: Lanes>(position: L::F, size: i32) -> L::I {
-    let rounded = L::truncate(L::add(position, L::splat(0.5)));
-    L::max_i(L::splat_i(0), L::min_i(rounded, L::splat_i(size - 1)))
+unsafe fn transferred<L: Lanes>(transfer: &RowTransfer, axis: usize, x: L::F, d: L::F) -> L::F {
+    let RowTransfer { along, start, shift, .. } = transfer;
+    let at_depth_1 = L::mul_add(x, L::splat(along[axis]), L::splat(start[axis]));
+    L::mul_add(at_depth_1, d, L::splat(shift[axis]))
 }
 
 /// Whether column and row lie beyond `least` and before the size plus `beyond`.
@@ -121,65 +249,12 @@ unsafe fn within<L: Lanes>([u, v]: [L::F; 2], least: f32, size: [i32; 2], beyond
     L::and(columns, rows)
 }
 
-/// The depth at `(u, v)`, as the options say, where all four pixels around are of the map; else 0.
-#[inline(always)]
-unsafe fn sample<L: Lanes>(
-    neighbour: &Neighbour<'_>,
-    options: &FilterOptions,
-    [u, v]: [L::F; 2],
-    inside: L::M,
-) -> L::F {
-    if L::bits(inside) == 0 {
-        return L::splat(0.0);
-    }
-    let (column, row) = (L::only_i(inside, L::truncate(u)), L::only_i(inside, L::truncate(v)));
-    let (fx, fy) = (L::sub(u, L::to_float(column)), L::sub(v, L::to_float(row)));
-    let index = L::add_i(L::mul_i(row, L::splat_i(neighbour.size[0])), column);
-    // Index 0 stands for what is not inside; where anything is, there are two rows and columns.
-    let (a, b) = L::gather_pairs(neighbour.depth, index);
-    let (c, d) = L::gather_pairs(&neighbour.depth[neighbour.size[0] as usize..], index);
-    let depth = match options.sampling {
-        DepthSampling::Bilinear => bilinear::<L>([a, b, c, d], fx, fy),
-        DepthSampling::Continuous => continuous::<L>([a, b, c, d], fx, fy, options.max_relative_depth),
-    };
-    L::only(inside, depth)
-}
-
-/// The same in the lanes of `border`, where some of the four pixels are outside, which is rare: those count as 0.
-#[cold]
-fn sample_border(
-    map: &Raster<f32>,
-    options: &FilterOptions,
-    u: [f32; LANES],
-    v: [f32; LANES],
-    border: u32,
-) -> [f32; LANES] {
-    let mut corners = [[0.0; LANES]; 4];
-    let (mut fx, mut fy) = ([0.0; LANES], [0.0; LANES]);
-    for k in (0..LANES).filter(|k| border >> k & 1 == 1) {
-        let (x, y) = (u[k].floor(), v[k].floor());
-        (fx[k], fy[k]) = (u[k] - x, v[k] - y);
-        for (corner, (dx, dy)) in corners.iter_mut().zip([(0, 0), (1, 0), (0, 1), (1, 1)]) {
-            // A negative index wraps to one that no raster has.
-            let depth = map.get((x as i64 + dx) as usize, (y as i64 + dy) as usize);
-            corner[k] = depth.unwrap_or(0.0);
-        }
-    }
-    // SAFETY: the portable lanes need nothing of the processor.
-    unsafe {
-        match options.sampling {
-            DepthSampling::Bilinear => bilinear::<Portable>(corners, fx, fy),
-            DepthSampling::Continuous => continuous::<Portable>(corners, fx, fy, options.max_relative_depth),
-        }
-    }
-}
-
 /// Bilinear over the four corners, whatever they hold.
 #[inline(always)]
 unsafe fn bilinear<L: Lanes>([a, b, c, d]: [L::F; 4], fx: L::F, fy: L::F) -> L::F {
-    let top = L::add(a, L::mul(fx, L::sub(b, a)));
-    let bottom = L::add(c, L::mul(fx, L::sub(d, c)));
-    L::add(top, L::mul(fy, L::sub(bottom, top)))
+    let top = L::mul_add(fx, L::sub(b, a), a);
+    let bottom = L::mul_add(fx, L::sub(d, c), c);
+    L::mul_add(fy, L::sub(bottom, top), top)
 }
 
 /// Bilinear over the corners that continue the surface of the nearest one.

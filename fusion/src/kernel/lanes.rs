@@ -1,17 +1,17 @@
-//! Eight lanes, as the processor at hand has them.
+//! Sixteen lanes, as the processor at hand has them.
 //!
-//! The kernel is written once over [`Lanes`]. No operation is fused or approximated, so the bits are the same
-//! with the vector instructions of the processor and with the safe [`Portable`] ones.
+//! The kernel is written once over [`Lanes`]. Operations are fused where the method says so, on every processor,
+//! and none is approximated: so the bits are the same with the vector instructions of the processor and with the
+//! safe [`Portable`] ones.
 
 /// Lanes of a vector.
-pub(crate) const LANES: usize = 8;
+pub(crate) const LANES: usize = 16;
 
-/// Operations on eight lanes.
+/// Operations on sixteen lanes.
 ///
 /// # Safety
-/// Of every method: the processor has the implementor's instructions. Of those that read at indices, too:
-/// every index is one of the slice, as the method says. Methods are inlined into functions that enable
-/// the instructions.
+/// Of every method: the processor has the implementor's instructions. Methods are inlined into functions that enable
+/// them.
 pub(crate) trait Lanes {
     /// Floats.
     type F: Copy;
@@ -27,6 +27,10 @@ pub(crate) trait Lanes {
     unsafe fn sub(a: Self::F, b: Self::F) -> Self::F;
     unsafe fn mul(a: Self::F, b: Self::F) -> Self::F;
     unsafe fn div(a: Self::F, b: Self::F) -> Self::F;
+    /// `a b + c`, rounded once.
+    unsafe fn mul_add(a: Self::F, b: Self::F, c: Self::F) -> Self::F;
+    /// `c - a b`, rounded once.
+    unsafe fn mul_sub_from(a: Self::F, b: Self::F, c: Self::F) -> Self::F;
     unsafe fn abs(a: Self::F) -> Self::F;
     unsafe fn sqrt(a: Self::F) -> Self::F;
     unsafe fn floor(a: Self::F) -> Self::F;
@@ -49,22 +53,32 @@ pub(crate) trait Lanes {
     unsafe fn add_i(a: Self::I, b: Self::I) -> Self::I;
     unsafe fn mul_i(a: Self::I, b: Self::I) -> Self::I;
     unsafe fn min_i(a: Self::I, b: Self::I) -> Self::I;
-    unsafe fn max_i(a: Self::I, b: Self::I) -> Self::I;
     unsafe fn or_i(a: Self::I, b: Self::I) -> Self::I;
     unsafe fn only_i(m: Self::M, v: Self::I) -> Self::I;
-    /// The byte above the lowest `BITS` bits.
-    unsafe fn byte<const BITS: i32>(v: Self::I) -> Self::I;
+    unsafe fn sub_i(a: Self::I, b: Self::I) -> Self::I;
+    unsafe fn and_i(a: Self::I, b: Self::I) -> Self::I;
+    /// Bits move down by `by`, from 0 to 31.
+    unsafe fn shift_down(v: Self::I, by: Self::I) -> Self::I;
     /// Towards 0. What no `i32` holds becomes any integer.
     unsafe fn truncate(v: Self::F) -> Self::I;
     unsafe fn to_float(v: Self::I) -> Self::F;
 
-    /// The values at each index.
-    unsafe fn gather(from: &[f32], index: Self::I) -> Self::F;
-    /// The values at each index and at the next one, which is one of the slice, too.
-    unsafe fn gather_pairs(from: &[f32], index: Self::I) -> (Self::F, Self::F);
-    /// Red, green and blue of the pixels at each index, in the three lowest bytes; the highest means nothing. There
-    /// are at least two pixels.
-    unsafe fn gather_rgb(from: &[[u8; 3]], index: Self::I) -> Self::I;
+    /// The first and the second values of [`Pairs`].
+    unsafe fn load_pairs(from: &Pairs) -> (Self::F, Self::F);
+    /// Has the processor fetch a place, if it is one, into its second cache.
+    unsafe fn prefetch<T>(place: *const T);
+}
+
+/// Two values for each lane, that of lane k at [`pair_of_lane`]: so that shuffles within a quarter of the widest
+/// register tell them apart.
+#[derive(Clone, Copy, Default)]
+#[repr(align(64))]
+pub(crate) struct Pairs(pub [[f32; 2]; LANES]);
+
+/// Two lanes of each four lie in the first half.
+#[inline(always)]
+pub(crate) const fn pair_of_lane(lane: usize) -> usize {
+    lane / 4 * 2 + lane % 2 + if lane % 4 < 2 { 0 } else { LANES / 2 }
 }
 
 /// Arrays, for every processor.
@@ -76,7 +90,7 @@ fn each<A: Copy, B: Copy, C>(a: [A; LANES], b: [B; LANES], f: impl Fn(A, B) -> C
 }
 
 /// # Safety
-/// Nothing is asked of the processor, and indices are checked.
+/// Nothing is asked of the processor.
 impl Lanes for Portable {
     type F = [f32; LANES];
     type I = [i32; LANES];
@@ -109,6 +123,14 @@ impl Lanes for Portable {
     #[inline(always)]
     unsafe fn div(a: Self::F, b: Self::F) -> Self::F {
         each(a, b, |a, b| a / b)
+    }
+    #[inline(always)]
+    unsafe fn mul_add(a: Self::F, b: Self::F, c: Self::F) -> Self::F {
+        std::array::from_fn(|k| a[k].mul_add(b[k], c[k]))
+    }
+    #[inline(always)]
+    unsafe fn mul_sub_from(a: Self::F, b: Self::F, c: Self::F) -> Self::F {
+        std::array::from_fn(|k| (-a[k]).mul_add(b[k], c[k]))
     }
     #[inline(always)]
     unsafe fn abs(a: Self::F) -> Self::F {
@@ -175,10 +197,6 @@ impl Lanes for Portable {
         each(a, b, i32::min)
     }
     #[inline(always)]
-    unsafe fn max_i(a: Self::I, b: Self::I) -> Self::I {
-        each(a, b, i32::max)
-    }
-    #[inline(always)]
     unsafe fn or_i(a: Self::I, b: Self::I) -> Self::I {
         each(a, b, |a, b| a | b)
     }
@@ -187,8 +205,16 @@ impl Lanes for Portable {
         each(m, v, |m, v| if m { v } else { 0 })
     }
     #[inline(always)]
-    unsafe fn byte<const BITS: i32>(v: Self::I) -> Self::I {
-        v.map(|v| v >> BITS & 255)
+    unsafe fn sub_i(a: Self::I, b: Self::I) -> Self::I {
+        each(a, b, i32::wrapping_sub)
+    }
+    #[inline(always)]
+    unsafe fn and_i(a: Self::I, b: Self::I) -> Self::I {
+        each(a, b, |a, b| a & b)
+    }
+    #[inline(always)]
+    unsafe fn shift_down(v: Self::I, by: Self::I) -> Self::I {
+        each(v, by, |v, by| (v as u32 >> by) as i32)
     }
     #[inline(always)]
     unsafe fn truncate(v: Self::F) -> Self::I {
@@ -199,18 +225,10 @@ impl Lanes for Portable {
         v.map(|v| v as f32)
     }
     #[inline(always)]
-    unsafe fn gather(from: &[f32], index: Self::I) -> Self::F {
-        index.map(|i| from[i as usize])
+    unsafe fn load_pairs(from: &Pairs) -> (Self::F, Self::F) {
+        let of = |which: usize| std::array::from_fn(|k| from.0[pair_of_lane(k)][which]);
+        (of(0), of(1))
     }
     #[inline(always)]
-    unsafe fn gather_pairs(from: &[f32], index: Self::I) -> (Self::F, Self::F) {
-        (index.map(|i| from[i as usize]), index.map(|i| from[i as usize + 1]))
-    }
-    #[inline(always)]
-    unsafe fn gather_rgb(from: &[[u8; 3]], index: Self::I) -> Self::I {
-        index.map(|i| {
-            let [r, g, b] = from[i as usize];
-            i32::from_le_bytes([r, g, b, 0])
-        })
-    }
+    unsafe fn prefetch<T>(_: *const T) {}
 }

@@ -1,14 +1,30 @@
-//! What the views that agree make of a hypothesis: its colour, its confidence, and who owns the surface.
+//! What the views that agree make of a hypothesis: its depth, its colour, its confidence, and who owns the surface.
 #![allow(unsafe_op_in_unsafe_fn, reason = "the contract of each function covers its body as a whole")]
 
+use super::agree::{Pixel, Place};
 use super::lanes::{LANES, Lanes};
-use super::{Answer, Input};
-use crate::surface::EQUAL_FOOTPRINTS;
+use super::{Block, Input};
+use crate::geometric::Neighbour;
 
-/// Eight hypotheses; those that are not kept mean nothing.
-pub(super) struct Merged {
+/// Sums over the views that agree with some hypotheses.
+pub(super) struct Sums<L: Lanes> {
+    count: L::F,
+    depth: L::F,
     /// Red, green and blue.
-    pub color: [[i32; LANES]; 3],
+    color: [L::I; 3],
+    confidence: L::F,
+    /// Which neighbours agree: the first 32, then the next.
+    agreeing: [L::I; 2],
+    /// Whether another view owns the surface.
+    beaten: L::M,
+}
+
+/// Sixteen hypotheses; those that are not kept mean nothing.
+pub(super) struct Means {
+    /// Of the reference's depths.
+    pub depth: [f32; LANES],
+    /// Red in the lowest byte, then green and blue.
+    pub color: [i32; LANES],
     /// In 255ths.
     pub confidence: [i32; LANES],
     /// Which neighbours agree: the first 32, then the next.
@@ -17,78 +33,102 @@ pub(super) struct Merged {
     pub owns: u32,
 }
 
-/// Merges the hypotheses in columns `x` with depths `d` that are `kept`, with `own` being the reference's depths
-/// where it agrees, and `count` views agreeing; the row of the reference has these colours and confidences.
-///
-/// Colours and confidences are those of the nearest pixel of each view. Agreeing views that are not confident
-/// there will not emit the surface, so they do not compete for it.
-///
-/// # Safety
-/// As [`Lanes`]; with vector instructions, a row of the reference and each neighbour have two pixels or more.
-#[inline(always)]
-pub(super) unsafe fn merge<L: Lanes>(
-    input: &Input<'_>,
-    (own_colors, own_confidences): (&[[u8; 3]], &[f32]),
-    (x, d, own): (L::F, L::F, L::F),
-    (kept, count): (L::M, L::F),
-    answers: &[Answer],
-) -> Merged {
-    let Input { neighbours, options, .. } = *input;
-    let zero = L::splat(0.0);
-    let column = L::min_i(L::truncate(x), L::splat_i(own_colors.len() as i32 - 1));
-    let has_own = L::and(kept, L::less(zero, own));
-    let mut color = channels::<L>(L::only_i(has_own, L::gather_rgb(own_colors, column)));
-    let mut confidence = L::only(has_own, L::gather(own_confidences, column));
-    let mut agreeing = [L::splat_i(0); 2];
-    let mut beaten = L::less(zero, zero);
-    let min_confidence = L::splat(options.min_confidence);
-    for (index, (neighbour, answer)) in neighbours.iter().zip(answers).enumerate() {
-        let agrees = L::and(kept, L::less(zero, L::load(&answer.depth)));
-        if L::bits(agrees) == 0 {
-            continue;
+impl<L: Lanes> Sums<L> {
+    /// The reference's own, where it agrees with the hypotheses of `block` in row `y`.
+    ///
+    /// # Safety
+    /// As [`Lanes`].
+    #[inline(always)]
+    pub unsafe fn of_reference(input: &Input<'_>, y: usize, block: &Block<'_>) -> Self {
+        let reference = input.reference;
+        let own = L::load(block.own);
+        let agrees = L::less(L::splat(0.0), own);
+        let (color_row, confidence_row) = (reference.color.row(y), reference.confidence.row(y));
+        let (mut color, mut confidence) = ([0; LANES], [0.0; LANES]);
+        for ((x, color), confidence) in block.columns.iter().zip(&mut color).zip(&mut confidence) {
+            let x = *x as usize;
+            let [r, g, b] = color_row[x];
+            *color = i32::from_le_bytes([r, g, b, 0]);
+            *confidence = confidence_row[x];
         }
-        let seen_color = channels::<L>(L::only_i(agrees, L::load_i(&answer.color)));
-        for channel in 0..3 {
-            color[channel] = L::add_i(color[channel], seen_color[channel]);
+        Self {
+            count: L::only(agrees, L::splat(1.0)),
+            depth: own,
+            color: channels::<L>(L::only_i(agrees, L::load_i(&color))),
+            confidence: L::only(agrees, L::load(&confidence)),
+            agreeing: [L::splat_i(0); 2],
+            beaten: L::less(own, own),
         }
-        let seen_confidence = L::load(&answer.confidence);
-        confidence = L::add(confidence, L::only(agrees, seen_confidence));
-        if let Some(bits) = agreeing.get_mut(index / 32) {
+    }
+
+    /// Adds what the neighbour at `index` sees of the hypotheses of depth `d`, where it `agrees`.
+    ///
+    /// A view with a smaller footprint owns the surface, if it is confident: it will not emit it otherwise.
+    ///
+    /// # Safety
+    /// As [`Lanes`].
+    #[inline(always)]
+    pub unsafe fn add(
+        &mut self,
+        (index, neighbour): (usize, &Neighbour<'_>),
+        min_confidence: f32,
+        (d, agrees): (L::F, L::M),
+        (place, pixel): (&Place, &Pixel),
+    ) {
+        let confidence = L::load(&pixel.confidence);
+        let color = L::shift_down(L::load_i(&pixel.color), L::load_i(&pixel.color_shift));
+        self.count = L::add(self.count, L::only(agrees, L::splat(1.0)));
+        self.depth = L::add(self.depth, L::only(agrees, L::load(&pixel.depth)));
+        for (sum, channel) in self.color.iter_mut().zip(channels::<L>(L::only_i(agrees, color))) {
+            *sum = L::add_i(*sum, channel);
+        }
+        self.confidence = L::add(self.confidence, L::only(agrees, confidence));
+        if let Some(bits) = self.agreeing.get_mut(index / 32) {
             let bit = L::splat_i((1_u32 << (index % 32)) as i32);
             *bits = L::or_i(*bits, L::only_i(agrees, bit));
         }
-        // Of views with one footprint the order of their places decides.
-        let rival = &neighbour.rival;
-        let footprint = L::mul(L::load(&answer.z), L::splat(rival.pixel_width));
-        let others = L::mul(d, L::splat(rival.reference_pixel_width));
-        let difference = L::abs(L::sub(footprint, others));
-        let equal = L::less(difference, L::mul(L::splat(EQUAL_FOOTPRINTS), others));
-        let smaller = L::less(footprint, others);
-        let better = if rival.wins_ties { L::or(equal, smaller) } else { L::but_not(smaller, equal) };
-        let better = L::but_not(better, L::less(seen_confidence, min_confidence));
-        beaten = L::or(beaten, L::and(agrees, better));
+        let smaller = L::less(L::load(&place.z), L::mul(L::splat(neighbour.rival.wins_below), d));
+        let better = L::but_not(smaller, L::less(confidence, L::splat(min_confidence)));
+        self.beaten = L::or(self.beaten, L::and(agrees, better));
     }
-    Merged {
-        color: [
-            rounded::<L>(L::to_float(color[0]), count, 1.0),
-            rounded::<L>(L::to_float(color[1]), count, 1.0),
-            rounded::<L>(L::to_float(color[2]), count, 1.0),
-        ],
-        confidence: rounded::<L>(confidence, count, 255.0),
-        agreeing: [L::store_i(agreeing[0]), L::store_i(agreeing[1])],
-        owns: !L::bits(beaten),
+
+    /// How many views agree, the reference included.
+    pub fn count(&self) -> L::F {
+        self.count
+    }
+
+    /// The means.
+    ///
+    /// # Safety
+    /// As [`Lanes`].
+    #[inline(always)]
+    pub unsafe fn means(&self) -> Means {
+        let scale = L::div(L::splat(1.0), self.count);
+        let [r, g, b] = self.color;
+        let (r, g, b) = (L::to_float(r), L::to_float(g), L::to_float(b));
+        let (r, g, b) = (rounded::<L>(r, scale), rounded::<L>(g, scale), rounded::<L>(b, scale));
+        let color = L::add_i(L::add_i(r, L::mul_i(g, L::splat_i(1 << 8))), L::mul_i(b, L::splat_i(1 << 16)));
+        let confidence = rounded::<L>(self.confidence, L::mul(scale, L::splat(255.0)));
+        Means {
+            depth: L::store(L::div(self.depth, self.count)),
+            color: L::store_i(color),
+            confidence: L::store_i(confidence),
+            agreeing: [L::store_i(self.agreeing[0]), L::store_i(self.agreeing[1])],
+            owns: !L::bits(self.beaten),
+        }
     }
 }
 
 /// Red, green and blue of colours whose bytes they are, the lowest first.
 #[inline(always)]
 unsafe fn channels<L: Lanes>(color: L::I) -> [L::I; 3] {
-    [L::byte::<0>(color), L::byte::<8>(color), L::byte::<16>(color)]
+    let (byte, eight) = (L::splat_i(255), L::splat_i(8));
+    let second = L::shift_down(color, eight);
+    [L::and_i(color, byte), L::and_i(second, byte), L::and_i(L::shift_down(second, eight), byte)]
 }
 
-/// The mean, scaled, rounded to nearest.
+/// The product, rounded to nearest.
 #[inline(always)]
-unsafe fn rounded<L: Lanes>(sum: L::F, count: L::F, scale: f32) -> [i32; LANES] {
-    let mean = L::mul(L::div(sum, count), L::splat(scale));
-    L::store_i(L::truncate(L::add(mean, L::splat(0.5))))
+unsafe fn rounded<L: Lanes>(sum: L::F, scale: L::F) -> L::I {
+    L::truncate(L::mul_add(sum, scale, L::splat(0.5)))
 }
