@@ -118,12 +118,12 @@ mod tests {
         assert_eq!(kept.iter().map(Bytes::len).sum::<usize>(), bytes.len());
 
         // Between large ones they keep their places.
-        let pieces = [&[1; KEPT_BYTES][..], &[2], &[3], &[4; KEPT_BYTES], &[5]];
+        let pieces = [vec![1; KEPT_BYTES], vec![2], vec![3], vec![4; KEPT_BYTES], vec![5]];
         let bytes = pieces.concat();
         let key = BlobKey::of(&bytes);
         let mut upload = store.upload(key, bytes.len() as u64);
         for piece in pieces {
-            upload.write(Bytes::copy_from_slice(piece)).await.expect("within the length");
+            upload.write(piece.into()).await.expect("within the length");
         }
         upload.finish().await.expect("written");
         assert!(store.get(key, bytes.len() as u64).await.expect("read") == bytes);
