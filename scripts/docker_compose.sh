@@ -20,8 +20,8 @@ unpack() {
     echo "deb [signed-by=$keyring] http://deb.debian.org/debian trixie main" > "$folder/sources"
     local options=(-qq -o "Dir::Etc::sourcelist=$folder/sources" -o Dir::Etc::sourceparts=-
         -o "Dir::State::lists=$folder/lists" -o "Dir::Cache=$folder" -o "APT::Sandbox::User=$(id -un)")
-    if (cd "$folder" && apt-get "${options[@]}" update && apt-get "${options[@]}" download docker-compose) >"$plugin.log" 2>&1 &&
-        dpkg-deb --extract "$folder"/docker-compose_*.deb "$folder/files" >>"$plugin.log" 2>&1; then
+    if (cd "$folder" && apt-get "${options[@]}" update && apt-get "${options[@]}" download docker-compose &&
+        dpkg-deb --extract docker-compose_*.deb files) >"$plugin.log" 2>&1; then
         install "$folder/files/usr/libexec/docker/cli-plugins/docker-compose" "$plugin.part"
         mv "$plugin.part" "$plugin"
     else

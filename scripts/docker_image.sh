@@ -49,4 +49,6 @@ cp "$program" "$context/planesweep"
 cp -L "$(dirname "$libtorch")"/*.so* "$context/lib/"
 # Everyone may read and run it, whatever the umask was.
 chmod -R a+rX "$context"
-docker build --quiet -f "$here/docker/Dockerfile" --target built --build-arg "DEBIAN=$base" -t "$image" "$context"
+# BuildKit wants a network, and an engine of the tests has none of its own.
+docker build --quiet --network host -f "$here/docker/Dockerfile" --target built --build-arg "DEBIAN=$base" \
+    -t "$image" "$context"

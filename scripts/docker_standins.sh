@@ -60,5 +60,5 @@ DOCKER
 
 chmod -R a+rX "$context"
 for one in postgres s3; do
-    docker build --quiet -f "$context/$one.docker" -t "$name-$one" "$context"
+    docker build --quiet --network host -f "$context/$one.docker" -t "$name-$one" "$context"
 done
