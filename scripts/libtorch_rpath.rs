@@ -1,5 +1,6 @@
 //! Build script of every crate whose programs or tests may link libtorch: tells the linker where they
-//! find it when they run. It stands in each of them, for link arguments do not reach dependents.
+//! find it when they run, and to keep its CUDA part. It stands in each of them, for link arguments do
+//! not reach dependents.
 
 use std::env;
 use std::path::PathBuf;
@@ -9,6 +10,12 @@ fn main() {
     // Without LIBTORCH the libraries are the system's own, which the loader finds by itself.
     if let Some(folder) = env::var_os("LIBTORCH").map(PathBuf::from) {
         let folder = folder.canonicalize().unwrap_or(folder);
-        println!("cargo:rustc-link-arg=-Wl,-rpath,{}", folder.join("lib").display());
+        let libraries = folder.join("lib");
+        println!("cargo:rustc-link-arg=-Wl,-rpath,{}", libraries.display());
+        // Nobody refers to it by a symbol, so the linker would leave it out: loaded, it makes itself known.
+        let cuda = libraries.join("libtorch_cuda.so");
+        if cuda.exists() {
+            println!("cargo:rustc-link-arg=-Wl,--no-as-needed,{}", cuda.display());
+        }
     }
 }
