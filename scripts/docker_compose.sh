@@ -8,7 +8,7 @@ set -euo pipefail
 if docker compose version --short 2>/dev/null | grep -q '^v\?[2-9]'; then
     exec docker compose "$@"
 fi
-cache="${XDG_CACHE_HOME:-$HOME/.cache}/planesweep"
+cache="${XDG_CACHE_HOME:-${HOME:-/tmp}/.cache}/planesweep"
 plugin="$cache/docker-compose"
 
 unpack() {
@@ -22,8 +22,9 @@ unpack() {
         -o "Dir::State::lists=$folder/lists" -o "Dir::Cache=$folder" -o "APT::Sandbox::User=$(id -un)")
     if (cd "$folder" && apt-get "${options[@]}" update && apt-get "${options[@]}" download docker-compose &&
         dpkg-deb --extract docker-compose_*.deb files) >"$plugin.log" 2>&1; then
-        install "$folder/files/usr/libexec/docker/cli-plugins/docker-compose" "$plugin.part"
-        mv "$plugin.part" "$plugin"
+        # Nothing ends at a failure within a condition.
+        install "$folder/files/usr/libexec/docker/cli-plugins/docker-compose" "$plugin.part" &&
+            mv "$plugin.part" "$plugin"
     else
         echo "Docker Compose 2 cannot be fetched; see $plugin.log" >&2
     fi

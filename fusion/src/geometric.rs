@@ -22,11 +22,11 @@ const MAX_PIXELS: usize = 1 << 29;
 pub(crate) struct Neighbour<'a> {
     /// Its depth map.
     pub map: &'a DepthMap,
-    /// The map's rasters.
+    /// The map's rasters, all of its size; colours and confidences are empty where it is too large to be read.
     pub depth: &'a [f32],
     pub confidence: &'a [f32],
     pub color: &'a [[u8; 3]],
-    /// Columns and rows; 0 where the map is too large to be read.
+    /// Columns and rows; -1, which no place is before, where the map is too large to be read.
     pub size: [i32; 2],
     /// From one of its pixels to about where the next row of the reference lies: a row, as far as that goes.
     pub next_row: isize,
@@ -38,17 +38,23 @@ pub(crate) struct Neighbour<'a> {
 
 impl<'a> Neighbour<'a> {
     /// Prepares `map` to be asked about pixels of `reference`.
+    ///
+    /// # Panics
+    /// When the map's rasters differ in size: they are read without a check of each index.
     pub fn new(reference: &Camera, map: &'a DepthMap) -> Self {
         let there = Transfer::between(reference, &map.camera);
         let (width, height) = (map.width(), map.height());
+        let size = [width, height];
+        assert_eq!([map.confidence.width(), map.confidence.height()], size, "confidences of a map");
+        assert_eq!([map.color.width(), map.color.height()], size, "colours of a map");
         let is_small = width < MAX_SIDE && height < MAX_SIDE && map.depth.values().len() < MAX_PIXELS;
         let next_row = if there.matrix[(1, 1)] < 0.0 { -(width as isize) } else { width as isize };
         Self {
             map,
             depth: map.depth.values(),
-            confidence: map.confidence.values(),
-            color: map.color.values(),
-            size: if is_small { [width as i32, height as i32] } else { [0; 2] },
+            confidence: if is_small { map.confidence.values() } else { &[] },
+            color: if is_small { map.color.values() } else { &[] },
+            size: if is_small { size.map(|side| side as i32) } else { [-1; 2] },
             next_row,
             rival: Rival::new(&map.camera, reference),
             there,

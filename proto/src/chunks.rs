@@ -104,6 +104,12 @@ pub(crate) async fn receive(
             return refused(Code::TooLarge, format!("blob {key} comes with more than its {announced} bytes"));
         }
         chunk = next(&mut chunks, patience).await?;
+        if chunk.as_ref().is_some_and(|chunk| chunk.data.is_empty() || chunk.blob.is_some()) {
+            return refused(
+                Code::Invalid,
+                format!("blob {key} comes with a chunk that is empty or names it again"),
+            );
+        }
     }
     if (bytes.len() as u64) < announced {
         let text = format!("blob {key} ends after {} of its {announced} bytes", bytes.len());

@@ -29,6 +29,11 @@ const REFUSAL: (Duration, Duration) = (Duration::from_secs(10), Duration::from_s
 /// How long nobody is let in after a connection could not be accepted; there may be too many.
 const PAUSE: Duration = Duration::from_millis(100);
 
+/// Calls of one connection at a time; more wait at the caller.
+const MAX_STREAMS: u32 = 128;
+/// Data of a call that may be on its way before anybody reads it.
+const STREAM_WINDOW_BYTES: u32 = 1 << 20;
+
 /// Who a server is to those who call it.
 #[derive(Clone, PartialEq, Eq)]
 pub struct ServerTls {
@@ -77,8 +82,15 @@ impl ServerTls {
 }
 
 /// A server that probes its connections, and closes those on which nobody is there any more.
+///
+/// A call whose data waits for its turn takes no room from the other calls of its connection.
 pub fn probing_server() -> Server {
-    Server::builder().http2_keepalive_interval(Some(KEEP_ALIVE.0)).http2_keepalive_timeout(Some(KEEP_ALIVE.1))
+    Server::builder()
+        .http2_keepalive_interval(Some(KEEP_ALIVE.0))
+        .http2_keepalive_timeout(Some(KEEP_ALIVE.1))
+        .initial_stream_window_size(STREAM_WINDOW_BYTES)
+        .initial_connection_window_size((MAX_STREAMS + 1) * STREAM_WINDOW_BYTES)
+        .max_concurrent_streams(MAX_STREAMS)
 }
 
 /// Serves until `stopped`. With an acceptor, who speaks no TLS or does not end the handshake is refused, and counted.

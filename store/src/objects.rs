@@ -85,7 +85,8 @@ impl Objects {
     async fn said_identity(&self) -> Result<Option<String>, StoreError> {
         let read = async { self.objects.get(&Path::from(IDENTITY)).await?.bytes().await };
         match read.await {
-            Ok(bytes) => Ok(Some(String::from_utf8_lossy(&bytes).into_owned())),
+            // People write it with an editor or a shell, which end it with a line.
+            Ok(bytes) => Ok(Some(String::from_utf8_lossy(&bytes).trim().to_owned())),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
             Err(error) => Err(self.cannot_open(&error)),
         }

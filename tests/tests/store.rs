@@ -211,7 +211,8 @@ fn a_coordinator_whose_ledger_has_another_store_is_refused_and_told_what_to_do()
     let identity = fs::read_to_string(bench.path("store/identity")).expect("it says who it is");
     let advice = format!("write {identity} into the object \"identity\" of file://{other}");
     assert!(refused.stderr.contains(&advice), "{}", refused.stderr);
-    fs::write(format!("{other}/identity"), identity).expect("written");
+    // As a shell writes it.
+    fs::write(format!("{other}/identity"), format!("{identity}\n")).expect("written");
     let _ = Cluster::start_on(&ledger, &other, Vec::new(), &[]).drain().wait().expect_code(0);
 }
 

@@ -112,7 +112,7 @@ mod tests {
         assert!(!story.0.is_forsaken(story.at(70)) && story.0.is_forsaken(story.at(71)));
         assert_eq!(story.hear(1, Order::Drain, 71), Verdict::Obey);
 
-        // One that stays, or is only in trouble, is waited for as long as it takes.
+        // One that stays, or answers that it is in trouble, is waited for as long as it takes.
         assert_eq!(story.hear(0, Order::Work, 72), Verdict::Obey);
         assert!(!story.0.is_forsaken(story.at(1000)));
         assert_eq!(story.hear(1, Order::Drain, 1000), Verdict::Leave);

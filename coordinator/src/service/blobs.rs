@@ -99,6 +99,9 @@ impl Blobs for BlobService {
                     return Err(ServiceError::new(Code::TooLarge, text).into());
                 }
                 upload = Some(self.store.upload(key, length));
+            } else if data.is_empty() {
+                // Any number of them would hold the turn.
+                return Err(ServiceError::new(Code::Invalid, "a chunk is empty").into());
             }
             let Some(upload) = &mut upload else { break };
             upload.write(data).await.map_err(|e| refusal(&e))?;
@@ -164,7 +167,7 @@ mod tests {
     use super::*;
 
     /// Over soon for who waits in vain, and not for who is at work on a busy machine.
-    const SHORT: Duration = Duration::from_secs(2);
+    const SHORT: Duration = Duration::from_secs(5);
     /// How long an answer may take to come; far above what it ever takes.
     const DEADLINE: Duration = Duration::from_mins(1);
     /// More than fits into the windows and buffers between a server and a reader.
@@ -231,6 +234,22 @@ mod tests {
             let told = answer.await.expect("no panic").expect_err("it sent nothing");
             let is_said = told.message().contains("did not come");
             assert!(told.code() == tonic::Code::Unavailable && is_said, "{told}");
+        }
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn writers_that_wait_for_their_turn_hold_up_none_of_their_connection() {
+        let (_folder, url) = served().await;
+        // Twice as many writes as turns, on two connections.
+        let clients = [(); 2].map(|()| Client::connect(&url, None).expect("an address"));
+        let mut writes = tokio::task::JoinSet::new();
+        for (number, client) in (0..2 * MAX_WRITES).zip(clients.iter().cycle()) {
+            let mut blobs = client.blobs();
+            let bytes = Bytes::from(vec![number as u8; LARGE]);
+            writes.spawn(async move { blobs.write(&BlobKey::of(&bytes), bytes).await });
+        }
+        while let Some(write) = tokio::time::timeout(DEADLINE, writes.join_next()).await.expect("a turn") {
+            write.expect("no panic").expect("written");
         }
     }
 }

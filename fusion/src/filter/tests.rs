@@ -312,22 +312,19 @@ fn the_number_of_threads_changes_no_bit() {
     }
 }
 
-/// All that this processor has but the widest.
-fn levels() -> Vec<Level> {
-    #[cfg(target_arch = "x86_64")]
-    if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-        return vec![Level::Portable, Level::Avx2];
-    }
-    vec![Level::Portable]
-}
-
 #[test]
 fn wider_registers_change_no_bit() {
     let noise: Vec<_> = (0..991).map(|i| ((i as f32 * 0.3).sin(), 0.75 + (i as f32).sin() / 4.0)).collect();
     // Far apart, so that neighbours see parts only; the last ones have rows of no use to vectors.
     let places = PLACES.iter().chain(&[(2.0, 0.3), (-0.3, 1.7)]).zip([61, 61, 33, 80, 61, 61, 2]);
-    let maps: Vec<_> =
+    let mut maps: Vec<_> =
         places.map(|((x, y), width)| noisy_map(camera_at(*x, *y, width, 43), &noise)).collect();
+    maps.push(maps[0].clone());
+    let empty = maps.last_mut().expect("it was pushed");
+    empty.depth = Raster::filled(0, 0, 0.0);
+    empty.confidence = Raster::filled(0, 0, 0.0);
+    empty.color = Raster::filled(0, 0, [0; 3]);
+    maps.extend([(1, 1), (1, 9), (9, 1)].map(|(w, h)| noisy_map(camera_at(0.2, 0.1, w, h), &noise)));
     let neighbours: Vec<_> = maps[1..].iter().map(|map| Neighbour::new(&maps[0].camera, map)).collect();
     for (method, sampling) in METHODS.into_iter().flat_map(|method| {
         [DepthSampling::Bilinear, DepthSampling::Continuous].map(|sampling| (method, sampling))
@@ -337,7 +334,7 @@ fn wider_registers_change_no_bit() {
         let candidates = matches!(method, FusionMethod::Visibility | FusionMethod::VisibilityConfidence)
             .then(|| Candidates::new(&maps[0], &neighbours, &options));
         let mut row = RowFilter::default();
-        for (level, y) in levels().into_iter().flat_map(|level| (0..43).map(move |y| (level, y))) {
+        for (level, y) in Level::available().into_iter().flat_map(|level| (0..43).map(move |y| (level, y))) {
             let input = Input { reference: &maps[0], neighbours: &neighbours, options: &options, level };
             let (mut depth, mut color, mut views) = ([0.0; 61], [[0; 3]; 61], [0; 61]);
             let (mut confidence, mut agreeing, mut owns) = ([0; 61], [0; 61], [false; 61]);

@@ -89,7 +89,7 @@ pub(super) unsafe fn project<L: Lanes>(
 /// Fetches the depths of a neighbour at the places of hypotheses.
 ///
 /// # Safety
-/// As [`Lanes`]; `place` comes from [`project`] into this neighbour.
+/// As [`Lanes`]; `place` comes from [`project`] into this neighbour, and its depths were not fetched yet.
 #[inline(always)]
 pub(super) unsafe fn fetch_depths<L: Lanes>(neighbour: &Neighbour<'_>, place: &mut Place) {
     if place.inside != 0 {
@@ -98,12 +98,14 @@ pub(super) unsafe fn fetch_depths<L: Lanes>(neighbour: &Neighbour<'_>, place: &m
         for k in 0..LANES {
             // SAFETY: the corner is inside, so the next pixel and those below are of the map; or it is 0, and the map
             // has two rows and columns, since some lane is inside. Pairs hold as many as there are lanes.
+            debug_assert!(place.corner[k] as u32 as usize + columns + 1 < neighbour.depth.len());
             let upper = from.add(place.corner[k] as u32 as usize);
             copy_pair(upper, to.0.cast::<u64>().add(pair_of_lane(k)));
             copy_pair(upper.add(columns), to.1.cast::<u64>().add(pair_of_lane(k)));
         }
-        // The next row of the reference will ask for what lies in the next row here, which the processor does
-        // not foresee for all neighbours by itself: the band is fetched that it will lie in.
+        // The rows of the reference that come will ask for what lies in the rows beyond these here, which the processor
+        // does not foresee for all neighbours by itself: confidences and colours are fetched two rows ahead, depths
+        // a row more, for they are read of the row below, too.
         let band = place.corner[0] as isize + 2 * neighbour.next_row;
         for ahead in [band, band + LANES as isize] {
             L::prefetch(from.wrapping_offset(ahead + neighbour.next_row));
@@ -116,7 +118,7 @@ pub(super) unsafe fn fetch_depths<L: Lanes>(neighbour: &Neighbour<'_>, place: &m
     }
 }
 
-/// Volatile, lest the compiler make hardware's gathers of many copies: they take several times as long.
+/// Volatile, lest the compiler make hardware's gathers of many copies: they take longer.
 ///
 /// # Safety
 /// Two floats can be read, and written.
@@ -149,7 +151,7 @@ fn fetch_border(neighbour: &Neighbour<'_>, place: &mut Place) {
 /// Compares what a neighbour sees with the hypotheses in columns `x` with depths `d`.
 ///
 /// # Safety
-/// As [`Lanes`].
+/// As [`Lanes`]; `place` comes from [`fetch_depths`] with this neighbour.
 #[inline(always)]
 pub(super) unsafe fn compare<L: Lanes>(
     neighbour: &Neighbour<'_>,
@@ -194,7 +196,7 @@ pub(super) unsafe fn compare<L: Lanes>(
     let index = L::only_i(agrees, L::add_i(L::add_i(L::load_i(&place.corner), right), down));
     let color = L::add_i(L::add_i(index, index), index);
     // Four bytes are read: those of the last pixel with the one before.
-    let color_at = L::min_i(color, L::splat_i(3 * neighbour.color.len() as i32 - 4));
+    let color_at = L::min_i(color, L::splat_i((3 * neighbour.color.len() as i32 - 4).max(-1)));
     let beyond = L::sub_i(color, color_at);
     pixel.index = L::store_i(index);
     pixel.color_at = L::store_i(color_at);
@@ -213,10 +215,12 @@ pub(super) unsafe fn fetch_pixels(neighbour: &Neighbour<'_>, pixel: &mut Pixel) 
     }
     let (color, confidence) = (neighbour.color.as_ptr().cast::<u8>(), neighbour.confidence.as_ptr());
     for k in 0..LANES {
-        // SAFETY: the index is a pixel of the map, and its colour is among four bytes that are, for there are two
-        // pixels. Volatile as pairs are.
+        // SAFETY: the index is a pixel of the map, whose rasters have one size, and its colour is among four bytes that
+        // are, for there are two pixels. Volatile as pairs are.
+        debug_assert!((pixel.index[k] as u32 as usize) < neighbour.confidence.len());
+        debug_assert!(pixel.color_at[k] as u32 as usize + 4 <= 3 * neighbour.color.len());
         let color = color.add(pixel.color_at[k] as u32 as usize).cast::<i32>();
-        (&raw mut pixel.color[k]).write_volatile(color.read_unaligned());
+        (&raw mut pixel.color[k]).write_volatile(i32::from_le(color.read_unaligned()));
         let confidence = confidence.add(pixel.index[k] as u32 as usize);
         (&raw mut pixel.confidence[k]).write_volatile(confidence.read());
     }

@@ -2,7 +2,7 @@
 //!
 //! The kernel is written once over [`Lanes`]. Operations are fused where the method says so, on every processor,
 //! and none is approximated: so the bits are the same with the vector instructions of the processor and with the
-//! safe [`Portable`] ones.
+//! ordinary ones of [`Portable`].
 
 /// Lanes of a vector.
 pub(crate) const LANES: usize = 16;

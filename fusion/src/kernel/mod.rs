@@ -45,21 +45,27 @@ pub(crate) enum Level {
 impl Level {
     /// The best that the processor has.
     pub fn detect() -> Self {
+        *Self::available().last().expect("every processor has the portable level")
+    }
+
+    /// All that the processor has, the best last.
+    pub fn available() -> Vec<Self> {
+        let mut levels = vec![Self::Portable];
         #[cfg(target_arch = "x86_64")]
         {
+            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+                levels.push(Self::Avx2);
+            }
             if is_x86_feature_detected!("avx512f")
                 && is_x86_feature_detected!("avx512bw")
                 && is_x86_feature_detected!("avx512dq")
                 && is_x86_feature_detected!("avx512vl")
                 && is_x86_feature_detected!("fma")
             {
-                return Self::Avx512;
-            }
-            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-                return Self::Avx2;
+                levels.push(Self::Avx512);
             }
         }
-        Self::Portable
+        levels
     }
 }
 
@@ -86,7 +92,7 @@ pub(crate) struct OutputRow<'a> {
 #[derive(Default)]
 pub(crate) struct Scratch {
     transfers: Vec<RowTransfer>,
-    /// By neighbour.
+    /// Of each neighbour, for this block and for the next.
     places: Vec<Place>,
     pixels: Vec<Pixel>,
     /// How many neighbours have each level of [`Pixel::level`].
@@ -104,7 +110,7 @@ pub(crate) fn filter_row(
     scratch.transfers.clear();
     scratch.transfers.extend(input.neighbours.iter().map(|neighbour| neighbour.row_transfer(y)));
     match input.level {
-        // SAFETY: this level comes from `Level::detect`, which asked the processor.
+        // SAFETY: levels come from `Level::available`, which asked the processor.
         #[cfg(target_arch = "x86_64")]
         Level::Avx512 => unsafe { with_avx512(input, y, row, scratch, out) },
         // SAFETY: as above.
