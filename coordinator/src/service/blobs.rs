@@ -167,7 +167,7 @@ mod tests {
     use super::*;
 
     /// Over soon for who waits in vain, and not for who is at work on a busy machine.
-    const SHORT: Duration = Duration::from_secs(5);
+    const SHORT: Duration = Duration::from_secs(3);
     /// How long an answer may take to come; far above what it ever takes.
     const DEADLINE: Duration = Duration::from_mins(1);
     /// More than fits into the windows and buffers between a server and a reader.
@@ -217,6 +217,8 @@ mod tests {
         let write = blobs.write(&other_key, other);
         tokio::time::timeout(DEADLINE, write).await.expect("a turn").expect("written");
 
+        // By then the last of them has waited too long, too.
+        tokio::time::sleep(SHORT).await;
         for mut answer in stalled {
             let end = loop {
                 match answer.message().await {
