@@ -47,6 +47,20 @@ impl Regression {
         Self { probability: Stack::new(slabs), index: index.concat() }
     }
 
+    /// The divergence of the probabilities from equal ones at pixels whose truth is at no hypothesis, over all pixels.
+    pub(super) fn absent_loss(&self, truth: &Raster<f32>) -> f64 {
+        let Shape { columns, length, .. } = self.probability.shape;
+        let pixel = |x: usize, y: usize| {
+            let probability = self.probability.slabs[y].channel(x, 0);
+            let logarithms = probability.iter().map(|p| f64::from(p.max(f32::MIN_POSITIVE)).ln());
+            -logarithms.sum::<f64>() / length as f64 - (length as f64).ln()
+        };
+        let row =
+            |y: usize| (0..columns).filter(|x| truth.at(*x, y).is_infinite()).map(|x| pixel(x, y)).sum();
+        let rows: Vec<f64> = (0..self.probability.slabs.len()).into_par_iter().map(row).collect();
+        rows.iter().sum::<f64>() / self.index.len() as f64
+    }
+
     /// The gradient of the logits from that of the expected indices, and by the loss of pixels at no hypothesis.
     pub(super) fn gradient(&self, tools: &Tools, index: &[f64], truth: &Raster<f32>, absent: f64) -> Stack {
         let Shape { columns, length, .. } = self.probability.shape;
@@ -64,22 +78,6 @@ impl Regression {
                 }
             }
         })
-    }
-}
-
-impl Regression {
-    /// The divergence of the probabilities from equal ones at pixels whose truth is at no hypothesis, over all pixels.
-    pub(super) fn absent_loss(&self, truth: &Raster<f32>) -> f64 {
-        let Shape { columns, length, .. } = self.probability.shape;
-        let pixel = |x: usize, y: usize| {
-            let probability = self.probability.slabs[y].channel(x, 0);
-            let logarithms = probability.iter().map(|p| f64::from(p.max(f32::MIN_POSITIVE)).ln());
-            -logarithms.sum::<f64>() / length as f64 - (length as f64).ln()
-        };
-        let row =
-            |y: usize| (0..columns).filter(|x| truth.at(*x, y).is_infinite()).map(|x| pixel(x, y)).sum();
-        let rows: Vec<f64> = (0..self.probability.slabs.len()).into_par_iter().map(row).collect();
-        rows.iter().sum::<f64>() / self.index.len() as f64
     }
 }
 
