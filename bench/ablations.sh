@@ -2,7 +2,8 @@
 # Networks and ways to train them, measured on our own terms: the same samples and steps for each, then the errors of
 # all on generated courtyards.
 #   paper    the ablations of the paper's section 5.4, tested with 2, 3 and 5 views
-#   choices  what mvsnet/weights/default.toml chooses: sampling, normalisation, views, weights of the loss
+#   choices  what the paper leaves open: sampling, normalisation, views, weights of the loss; each changes one thing of
+#            `base`, in which pixels without a surface count
 # usage: ablations.sh PROGRAM OUT [STEPS] [paper|choices]; run again, it goes on where it stopped.
 set -euo pipefail
 program=$1
