@@ -4,6 +4,8 @@
 //! ```text
 //! cargo run --release -p planesweep-fusion --example bench_fusion -- --twin python3 --runs 15
 //! ```
+//!
+//! `--width 288` runs the maps of that width alone, `--method dynamic` that method.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -11,7 +13,8 @@ use std::hint::black_box;
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use std::time::Instant;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
 
 use nalgebra::{Point2, Point3, Vector3};
 use planesweep_fusion::{
@@ -20,6 +23,8 @@ use planesweep_fusion::{
 use planesweep_scene::{Camera, DepthMap, Intrinsics, Pose, Raster};
 
 const NEIGHBOURS: usize = 10;
+/// Longer than the threads of numpy and OpenCV wait in loops.
+const IDLE: Duration = Duration::from_millis(200);
 const METHODS: [FusionMethod; 4] = [
     FusionMethod::Consistency,
     FusionMethod::Dynamic,
@@ -37,7 +42,11 @@ fn main() {
             METHODS.into_iter().filter(|method| format!("{method:?}").eq_ignore_ascii_case(name)).collect()
         },
     );
+    let only = option("--width").map(|width| width.parse().expect("--width PIXELS"));
     for (width, height) in [(96, 72), (288, 216), (1152, 864)] {
+        if only.is_some_and(|only: u32| only != width) {
+            continue;
+        }
         let maps: Vec<DepthMap> = (0..=NEIGHBOURS).map(|k| view(k, width, height)).collect();
         println!(
             "{width}x{height}, {NEIGHBOURS} neighbours, median of {runs} runs, with the least and the most"
@@ -113,6 +122,8 @@ fn against_twin(maps: &[DepthMap], python: &str, runs: usize) {
     let (mut ours, mut theirs, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
     let (mut own_cpu, mut twin_cpu) = (0.0, 0.0);
     for _ in 0..runs {
+        // Numpy's threads wait in loops for more to do, and would take a processor from us.
+        sleep(IDLE);
         // The first of two runs warms the caches that the other program emptied.
         fuse(maps, FusionMethod::Consistency);
         let before = cpu_milliseconds();

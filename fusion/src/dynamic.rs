@@ -1,7 +1,7 @@
 //! Dynamic consistency: the more views agree, the less closely each must (D2HC-RMVSNet, Yan et al.
 //! 2020, section 3.3).
 
-use crate::kernel::{LANES, Lanes, Pixel};
+use crate::kernel::{Answer, LANES, Lanes};
 
 /// Pixels of reprojection error that each further neighbour allows, inverted.
 const LEVELS_PER_PIXEL: f32 = 4.0;
@@ -31,21 +31,21 @@ pub(crate) unsafe fn level<L: Lanes>(squared_px: L::F, relative_depth: L::F) -> 
 /// Keeps, for each hypothesis, the neighbours that meet the strictest thresholds that enough of them
 /// meet: those of level n or less, for the least n of at least `min_neighbours` that n of them meet.
 /// Keeps none where there is no such n.
-pub(crate) fn settle(pixels: &mut [Pixel], having: &mut Vec<u32>, min_neighbours: u32) {
-    let most = pixels.len();
+pub(crate) fn settle(answers: &mut [Answer], having: &mut Vec<u32>, min_neighbours: u32) {
+    let most = answers.len();
     for k in 0..LANES {
         having.clear();
         having.resize(most + 1, 0);
-        for pixel in pixels.iter().filter(|pixel| pixel.depth[k] > 0.0) {
+        for answer in answers.iter().filter(|answer| answer.depth[k] > 0.0) {
             // Levels beyond `most`, which nothing can decide for, have no place.
-            if let Some(having) = having.get_mut(pixel.level[k] as usize) {
+            if let Some(having) = having.get_mut(answer.level[k] as usize) {
                 *having += 1;
             }
         }
         let decided = decided(having, min_neighbours.max(1) as usize);
-        for pixel in pixels.iter_mut() {
-            let met = decided.is_some_and(|n| pixel.level[k] <= n as f32);
-            pixel.depth[k] = if met { pixel.depth[k] } else { 0.0 };
+        for answer in answers.iter_mut() {
+            let met = decided.is_some_and(|n| answer.level[k] <= n as f32);
+            answer.depth[k] = if met { answer.depth[k] } else { 0.0 };
         }
     }
 }
@@ -89,14 +89,14 @@ mod tests {
     fn settled(levels: [f32; 5], min_neighbours: u32) -> [bool; 5] {
         // The last lane stands for all, so that none is forgotten.
         let lanes = |value: f32| std::array::from_fn(|k| if k + 1 == LANES { value } else { 0.0 });
-        let pixel = |level: f32| Pixel {
+        let answer = |level: f32| Answer {
             depth: lanes(if level > 0.0 { 2.0 } else { 0.0 }),
             level: lanes(level),
-            ..Pixel::default()
+            ..Answer::default()
         };
-        let mut pixels = levels.map(pixel);
-        settle(&mut pixels, &mut Vec::new(), min_neighbours);
-        pixels.map(|pixel| pixel.depth[LANES - 1] > 0.0)
+        let mut answers = levels.map(answer);
+        settle(&mut answers, &mut Vec::new(), min_neighbours);
+        answers.map(|answer| answer.depth[LANES - 1] > 0.0)
     }
 
     #[test]

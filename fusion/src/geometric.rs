@@ -26,8 +26,12 @@ pub(crate) struct Neighbour<'a> {
     pub depth: &'a [f32],
     pub confidence: &'a [f32],
     pub color: &'a [[u8; 3]],
-    /// Columns and rows; -1, which no place is before, where the map is too large to be read.
+    /// Columns and rows; 0 where the map is too large to be read.
     pub size: [i32; 2],
+    /// Columns and rows of pixels that have others to the right and below: of the squares between four pixels.
+    pub squares: [i32; 2],
+    /// The same with the squares that only touch the map, one more at each side.
+    pub touching_squares: [i32; 2],
     /// From one of its pixels to about where the next row of the reference lies: a row, as far as that goes.
     pub next_row: isize,
     /// How it competes with the reference for a surface.
@@ -48,13 +52,16 @@ impl<'a> Neighbour<'a> {
         assert_eq!([map.confidence.width(), map.confidence.height()], size, "confidences of a map");
         assert_eq!([map.color.width(), map.color.height()], size, "colours of a map");
         let is_small = width < MAX_SIDE && height < MAX_SIDE && map.depth.values().len() < MAX_PIXELS;
+        let extent = if is_small { size.map(|side| side as i32) } else { [0; 2] };
         let next_row = if there.matrix[(1, 1)] < 0.0 { -(width as isize) } else { width as isize };
         Self {
             map,
             depth: map.depth.values(),
             confidence: if is_small { map.confidence.values() } else { &[] },
             color: if is_small { map.color.values() } else { &[] },
-            size: if is_small { size.map(|side| side as i32) } else { [-1; 2] },
+            size: extent,
+            squares: extent.map(|side| (side - 1).max(0)),
+            touching_squares: extent.map(|side| if side > 0 { side + 1 } else { 0 }),
             next_row,
             rival: Rival::new(&map.camera, reference),
             there,
@@ -84,8 +91,8 @@ pub(crate) struct RowTransfer {
     pub shift: [f32; 3],
     /// Column and depth of the other camera's centre as a homogeneous pixel `(x, y, z)` of this camera.
     pub centre: [f32; 2],
-    /// How far that lies beside the row, `y - row z`.
-    pub centre_beside_row: f32,
+    /// How far that lies beside the row, `y - row z`, squared.
+    pub squared_beside_row: f32,
 }
 
 impl RowTransfer {
@@ -128,7 +135,7 @@ impl Transfer {
             start: (matrix.column(1) * y as f64 + matrix.column(2)).map(|m| m as f32).into(),
             shift: vector.map(|m| m as f32).into(),
             centre: [centre.x as f32, centre.z as f32],
-            centre_beside_row: (centre.y - y as f64 * centre.z) as f32,
+            squared_beside_row: (centre.y - y as f64 * centre.z).powi(2) as f32,
         }
     }
 }

@@ -2,47 +2,112 @@
 
 use crate::kernel::LANES;
 
-/// At most one depth for each pixel of a row, packed: what the kernel runs over.
-#[derive(Default)]
-pub(crate) struct HypothesisRow {
-    /// Columns, ascending.
-    columns: Vec<f32>,
+/// Depths of neighbouring pixels that differ by less, relatively, are taken for one surface.
+const ONE_SURFACE: f32 = 0.02;
+/// As many in a row that lie apart from the surface before make a surface.
+const NEXT_SURFACE: usize = 3;
+/// From the first column of a block to the first that is no longer of it, unless the columns are apart anyway.
+const MAX_COLUMNS: i32 = 24;
+
+/// One of them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Hypothesis {
+    pub column: i32,
     /// The depth to be tested.
-    depths: Vec<f32>,
+    pub depth: f32,
     /// The reference's own depth where it agrees with that; else 0.
-    own: Vec<f32>,
-    count: usize,
+    pub own: f32,
 }
 
-/// As many hypotheses as the kernel takes at a time; depths of 0 fill up the last ones.
-pub(crate) struct Block<'a> {
-    pub columns: &'a [f32; LANES],
-    pub depths: &'a [f32; LANES],
-    pub own: &'a [f32; LANES],
-    /// How many of them there are.
+/// At most one depth for each pixel of a row, in blocks: what the kernel runs over.
+///
+/// Neighbouring pixels of one surface come together, for they lie close together in other views, too. Those that lie
+/// apart, outliers above all, come at the end.
+#[derive(Default)]
+pub(crate) struct HypothesisRow {
+    blocks: Vec<Block>,
+    apart: Vec<Hypothesis>,
+    /// How many there are.
+    count: usize,
+    /// Depth of the surface that was seen last, and how many were apart from it since.
+    surface: f32,
+    since: usize,
+}
+
+/// As many hypotheses as the kernel takes at a time; columns of 0 and depths that are no numbers fill up the rest.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+pub(crate) struct Block {
+    pub columns: [i32; LANES],
+    pub depths: [f32; LANES],
+    /// As [`Hypothesis::own`].
+    pub own: [f32; LANES],
+    /// How many hypotheses there are.
     pub count: usize,
 }
 
+impl Default for Block {
+    fn default() -> Self {
+        Self { columns: [0; LANES], depths: [f32::NAN; LANES], own: [0.0; LANES], count: 0 }
+    }
+}
+
+impl Block {
+    /// Whether all hypotheses lie within so many columns.
+    pub fn is_within(&self, columns: i32) -> bool {
+        let last = self.columns[self.count.clamp(1, LANES) - 1];
+        last - self.columns[0] < columns
+    }
+}
+
 impl HypothesisRow {
-    /// Empties the row, and makes room for `width` hypotheses.
-    pub fn clear(&mut self, width: usize) {
-        let padded = width.next_multiple_of(LANES) + LANES;
-        for values in [&mut self.columns, &mut self.depths, &mut self.own] {
-            values.resize(padded, 0.0);
-        }
+    /// Empties the row.
+    pub fn clear(&mut self) {
+        self.blocks.clear();
+        self.apart.clear();
         self.count = 0;
     }
 
-    /// Adds a hypothesis if it `counts`; without a branch.
-    ///
-    /// # Panics
-    /// When there is no room for it.
+    /// Adds a hypothesis in a column behind all others.
     #[inline]
-    pub fn push_if(&mut self, counts: bool, column: usize, depth: f32, own: f32) {
-        self.columns[self.count] = column as f32;
-        self.depths[self.count] = depth;
-        self.own[self.count] = own;
-        self.count += usize::from(counts);
+    pub fn push(&mut self, hypothesis: Hypothesis) {
+        let depth = hypothesis.depth;
+        let is_apart = (depth - self.surface).abs() >= ONE_SURFACE * depth;
+        if is_apart && self.count > 0 && self.since < NEXT_SURFACE {
+            self.since += 1;
+            self.apart.push(hypothesis);
+        } else {
+            (self.surface, self.since) = (depth, 0);
+            self.append(hypothesis, MAX_COLUMNS);
+        }
+        self.count += 1;
+    }
+
+    #[inline]
+    fn append(&mut self, hypothesis: Hypothesis, max_columns: i32) {
+        let Hypothesis { column, depth, own } = hypothesis;
+        let block = match self.blocks.last_mut() {
+            Some(block) if block.count < LANES && column - block.columns[0] < max_columns => block,
+            _ => {
+                self.blocks.push(Block::default());
+                self.blocks.last_mut().expect("just pushed")
+            }
+        };
+        let lane = block.count;
+        (block.columns[lane], block.depths[lane], block.own[lane]) = (column, depth, own);
+        block.count += 1;
+    }
+
+    /// Adds those that lie apart.
+    pub fn end(&mut self) {
+        let apart = std::mem::take(&mut self.apart);
+        if !apart.is_empty() {
+            self.blocks.push(Block::default());
+        }
+        for hypothesis in &apart {
+            self.append(*hypothesis, i32::MAX);
+        }
+        self.apart = apart;
     }
 
     /// How many hypotheses there are.
@@ -50,37 +115,61 @@ impl HypothesisRow {
         self.count
     }
 
-    /// Fills up the last block.
-    pub fn end(&mut self) {
-        let end = self.count.next_multiple_of(LANES);
-        for values in [&mut self.columns, &mut self.depths, &mut self.own] {
-            values[self.count..end].fill(0.0);
+    /// All of them, after [`HypothesisRow::end`].
+    pub fn blocks(&self) -> &[Block] {
+        &self.blocks
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(hypotheses: &[(i32, f32)]) -> HypothesisRow {
+        let mut row = HypothesisRow::default();
+        // What was in it before plays no part.
+        for depth in [7.0, 70.0] {
+            row.push(Hypothesis { column: 0, depth, own: 0.0 });
         }
-    }
-
-    /// How many blocks there are, after [`HypothesisRow::end`].
-    pub fn blocks(&self) -> usize {
-        self.count.div_ceil(LANES)
-    }
-
-    /// One of them.
-    ///
-    /// # Panics
-    /// When there are fewer.
-    #[inline]
-    pub fn block(&self, index: usize) -> Block<'_> {
-        Block {
-            columns: &self.columns.as_chunks().0[index],
-            depths: &self.depths.as_chunks().0[index],
-            own: &self.own.as_chunks().0[index],
-            count: LANES.min(self.count - LANES * index),
+        row.end();
+        row.clear();
+        for (column, depth) in hypotheses.iter().copied() {
+            row.push(Hypothesis { column, depth, own: -depth });
         }
+        row.end();
+        row
     }
 
-    /// The depths by column.
-    #[cfg(test)]
-    pub fn iter(&self) -> impl Iterator<Item = (usize, f32, f32)> {
-        let values = self.columns.iter().zip(self.depths.iter().zip(&self.own)).take(self.count);
-        values.map(|(x, (depth, own))| (*x as usize, *depth, *own))
+    /// Columns and depths of each block.
+    fn blocks(row: &HypothesisRow) -> Vec<Vec<(i32, f32)>> {
+        let lanes = |block: &Block| {
+            assert!(block.own.iter().zip(block.depths).take(block.count).all(|(own, depth)| *own == -depth));
+            assert!(block.depths[block.count..].iter().all(|depth| depth.is_nan()));
+            block.columns.into_iter().zip(block.depths).take(block.count).collect()
+        };
+        row.blocks().iter().map(lanes).collect()
+    }
+
+    #[test]
+    fn outliers_come_last() {
+        let row = row(&[(0, 1.0), (1, 1.01), (2, 1.5), (3, 1.02), (4, 0.5), (5, 1.03)]);
+        let surface = vec![(0, 1.0), (1, 1.01), (3, 1.02), (5, 1.03)];
+        assert_eq!(blocks(&row), [surface, vec![(2, 1.5), (4, 0.5)]]);
+        assert_eq!(row.len(), 6);
+    }
+
+    #[test]
+    fn another_surface_is_noticed_soon() {
+        let row = row(&[(0, 1.0), (1, 2.0), (2, 2.0), (3, 2.0), (4, 2.0), (5, 2.0), (6, 1.0)]);
+        let apart = vec![(1, 2.0), (2, 2.0), (3, 2.0), (6, 1.0)];
+        assert_eq!(blocks(&row), [vec![(0, 1.0), (4, 2.0), (5, 2.0)], apart]);
+    }
+
+    #[test]
+    fn blocks_are_full_unless_their_columns_are_far_apart() {
+        let row = row(&(0..40).map(|x| (if x < 20 { x } else { x + 30 }, 3.0)).collect::<Vec<_>>());
+        let counts: Vec<_> = row.blocks().iter().map(|block| block.count).collect();
+        assert_eq!(counts, [16, 4, 16, 4]);
+        assert!(self::row(&[]).blocks().is_empty());
     }
 }

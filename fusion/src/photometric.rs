@@ -2,7 +2,7 @@
 
 use planesweep_scene::DepthMap;
 
-use crate::hypotheses::HypothesisRow;
+use crate::hypotheses::{Hypothesis, HypothesisRow};
 
 /// Makes the confident depths of row `y` of `map` its hypotheses; returns how many pixels of the row
 /// have a depth, confident or not.
@@ -12,12 +12,14 @@ pub(crate) fn confident_depths(
     min_confidence: f32,
     row: &mut HypothesisRow,
 ) -> usize {
-    row.clear(map.width());
+    row.clear();
     let mut with_depth = 0;
     for (x, (&depth, &confidence)) in map.depth.row(y).iter().zip(map.confidence.row(y)).enumerate() {
         let has_depth = depth > 0.0;
         with_depth += usize::from(has_depth);
-        row.push_if(has_depth && confidence >= min_confidence, x, depth, depth);
+        if has_depth && confidence >= min_confidence {
+            row.push(Hypothesis { column: x as i32, depth, own: depth });
+        }
     }
     row.end();
     with_depth
@@ -31,7 +33,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn confident_depths_are_packed_in_order() {
+    fn confident_depths_are_packed() {
         let intrinsics = Intrinsics { width: 5, height: 2, fx: 1.0, fy: 1.0, skew: 0.0, cx: 0.0, cy: 0.0 };
         let pose = Pose { rotation: Matrix3::identity(), translation: Vector3::zeros() };
         let map = DepthMap::new(
@@ -44,8 +46,9 @@ mod tests {
         let mut row = HypothesisRow::default();
         confident_depths(&map, 0, 0.8, &mut row);
         assert_eq!(confident_depths(&map, 1, 0.8, &mut row), 3);
-        assert_eq!(row.iter().collect::<Vec<_>>(), [(0, 1.0, 1.0), (3, 4.0, 4.0)]);
-        assert_eq!((row.blocks(), row.block(0).count), (1, 2));
-        assert_eq!(row.block(0).depths[..3], [1.0, 4.0, 0.0]);
+        let lanes =
+            row.blocks().iter().map(|block| (block.count, block.columns[0], block.depths[0], block.own[0]));
+        assert_eq!(lanes.collect::<Vec<_>>(), [(1, 0, 1.0, 1.0), (1, 3, 4.0, 4.0)]);
+        assert_eq!(row.len(), 2);
     }
 }

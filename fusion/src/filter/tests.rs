@@ -1,4 +1,4 @@
-use nalgebra::{Point2, Point3};
+use nalgebra::{Point2, Point3, Rotation3, Vector3};
 use planesweep_scene::Pose;
 use proptest::prelude::*;
 
@@ -115,7 +115,7 @@ fn a_neighbour_that_looks_away_or_sees_nothing_confirms_nothing() {
     let reference = PLANE.map(camera_at(0.0, 0.0, 20, 16));
     let mut away = reference.clone();
     let centre = away.camera.pose.centre();
-    away.camera.pose = Pose::look_at(&centre, &Point3::new(0.0, 0.0, -9.0), &-nalgebra::Vector3::y());
+    away.camera.pose = Pose::look_at(&centre, &Point3::new(0.0, 0.0, -9.0), &-Vector3::y());
     let mut empty = reference.clone();
     empty.depth = Raster::filled(20, 16, 0.0);
     let filtered = filter(&reference, &[&away, &empty], &FilterOptions::default());
@@ -169,19 +169,36 @@ prop_compose! {
         noise in prop::collection::vec((-1.0..1.0_f32, 0.5..1.0_f32), 1000),
     ) -> Vec<DepthMap> {
         let map = |(k, (x, y)): (usize, &(f64, f64))| {
-            noisy_map(camera_at(*x, *y, 24 + 3 * k as u32, 18), &noise[37 * k..])
+            noisy_map(camera_at(*x, *y, 36 + 3 * k as u32, 18), &noise[37 * k..])
         };
         places.iter().enumerate().map(map).collect()
     }
 }
 
-/// The criterion in `f64`, word for word: the views that agree and their depths; `None` when a
-/// threshold is so close that rounding decides.
-fn agreeing(maps: &[DepthMap], x: usize, y: usize, options: &FilterOptions) -> Option<Vec<f64>> {
+/// What a view that agrees has for a hypothesis.
+struct Agreeing {
+    depth: f64,
+    color: [u8; 3],
+    confidence: f64,
+}
+
+/// The criterion in `f64`, word for word: the views that agree, by index; `None` when a threshold is so close that
+/// rounding decides.
+fn agreeing(
+    maps: &[DepthMap],
+    x: usize,
+    y: usize,
+    options: &FilterOptions,
+) -> Option<Vec<(usize, Agreeing)>> {
     let d = maps[0].depth.at(x, y) as f64;
     let p = Point2::new(x as f64, y as f64);
-    let mut depths = vec![d];
-    for map in &maps[1..] {
+    let of = |map: &DepthMap, depth: f64, x: usize, y: usize| Agreeing {
+        depth,
+        color: map.color.at(x, y),
+        confidence: map.confidence.at(x, y) as f64,
+    };
+    let mut views = vec![(0, of(&maps[0], d, x, y))];
+    for (index, map) in maps.iter().enumerate().skip(1) {
         let Some((q, _)) = map.camera.project(&maps[0].camera.unproject(&p, d)) else { continue };
         let (x0, y0) = (q.x.floor(), q.y.floor());
         let at = |x: f64, y: f64| {
@@ -201,15 +218,19 @@ fn agreeing(maps: &[DepthMap], x: usize, y: usize, options: &FilterOptions) -> O
         let Some((r, depth)) = maps[0].camera.project(&back) else { continue };
         let (distance, relative) = ((r - p).norm(), (depth - d).abs() / d);
         let (most_px, most) = (options.max_reprojection_px as f64, options.max_relative_depth as f64);
-        let borderline = (distance - most_px).abs() < 1e-3 || (relative - most).abs() < 1e-5;
+        let nearest = |position: f64, size: usize| (position.round().max(0.0) as usize).min(size - 1);
+        let borderline = (distance - most_px).abs() < 1e-3
+            || (relative - most).abs() < 1e-5
+            || (fx - 0.5).abs() < 1e-3
+            || (fy - 0.5).abs() < 1e-3;
         if borderline {
             return None;
         }
         if distance < most_px && relative < most {
-            depths.push(depth);
+            views.push((index, of(map, depth, nearest(q.x, map.width()), nearest(q.y, map.height()))));
         }
     }
-    Some(depths)
+    Some(views)
 }
 
 proptest! {
@@ -227,19 +248,30 @@ proptest! {
                 continue;
             }
             confident += 1;
-            let Some(depths) = agreeing(&maps, x, y, &options) else { continue };
+            let Some(views) = agreeing(&maps, x, y, &options) else { continue };
             compared += 1;
-            prop_assert_eq!(filtered.views.at(x, y) as usize, depths.len());
+            prop_assert_eq!(filtered.views.at(x, y) as usize, views.len());
             let depth = filtered.depth.at(x, y) as f64;
-            if depths.len() < min_views as usize {
-                prop_assert_eq!(depth, 0.0);
-            } else {
-                let mean = depths.iter().sum::<f64>() / depths.len() as f64;
-                prop_assert!((depth - mean).abs() < 1e-5 * mean, "{} for {}", depth, mean);
-                let least = depths.iter().copied().fold(f64::INFINITY, f64::min);
-                let most = depths.iter().copied().fold(0.0, f64::max);
-                prop_assert!((least * 0.999999..=most * 1.000001).contains(&depth));
+            if views.len() < min_views as usize {
+                prop_assert_eq!((depth, filtered.color.at(x, y), filtered.agreeing.at(x, y)), (0.0, [0; 3], 0));
+                continue;
             }
+            let mean = |of: &dyn Fn(&Agreeing) -> f64| {
+                views.iter().map(|(_, view)| of(view)).sum::<f64>() / views.len() as f64
+            };
+            let mean_depth = mean(&|view| view.depth);
+            prop_assert!((depth - mean_depth).abs() < 1e-5 * mean_depth, "{} for {}", depth, mean_depth);
+            let depths = || views.iter().map(|(_, view)| view.depth);
+            let (least, most) = (depths().fold(f64::INFINITY, f64::min), depths().fold(0.0, f64::max));
+            prop_assert!((least * 0.999999..=most * 1.000001).contains(&depth));
+            for (channel, value) in filtered.color.at(x, y).into_iter().enumerate() {
+                let mean = mean(&|view| view.color[channel].into());
+                prop_assert!((value as f64 - mean).abs() <= 0.501, "{} for {}", value, mean);
+            }
+            let confidence = 255.0 * mean(&|view| view.confidence);
+            prop_assert!((filtered.confidence.at(x, y) as f64 - confidence).abs() <= 0.501);
+            let agreeing = views.iter().skip(1).fold(0, |bits, (index, _)| bits | 1 << (index - 1));
+            prop_assert_eq!(filtered.agreeing.at(x, y), agreeing);
         }
         prop_assert!(compared * 10 >= confident * 9, "{} of {} compared", compared, confident);
     }
@@ -325,6 +357,14 @@ fn wider_registers_change_no_bit() {
     empty.confidence = Raster::filled(0, 0, 0.0);
     empty.color = Raster::filled(0, 0, [0; 3]);
     maps.extend([(1, 1), (1, 9), (9, 1)].map(|(w, h)| noisy_map(camera_at(0.2, 0.1, w, h), &noise)));
+    // Rolled, so that rows of the reference lie across theirs in every way.
+    maps.extend([0.05, 0.2, 1.6, 3.1, 4.7].map(|roll| {
+        let mut camera = camera_at(0.3, -0.2, 70, 50);
+        let rotation = Rotation3::from_axis_angle(&Vector3::z_axis(), roll).into_inner();
+        camera.pose.rotation = rotation * camera.pose.rotation;
+        camera.pose.translation = rotation * camera.pose.translation;
+        noisy_map(camera, &noise)
+    }));
     let neighbours: Vec<_> = maps[1..].iter().map(|map| Neighbour::new(&maps[0].camera, map)).collect();
     for (method, sampling) in METHODS.into_iter().flat_map(|method| {
         [DepthSampling::Bilinear, DepthSampling::Continuous].map(|sampling| (method, sampling))

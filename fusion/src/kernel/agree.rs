@@ -8,45 +8,64 @@
 //! P + q (C - P), with C the neighbour's centre and q = 1 - s / z.
 #![allow(unsafe_op_in_unsafe_fn, reason = "the contract of each function covers its body as a whole")]
 
-use super::lanes::{LANES, Lanes, Pairs, pair_of_lane};
+use super::lanes::{LANES, Lanes};
+use super::places;
+use super::window::Window;
 use crate::dynamic::level;
 use crate::geometric::{Neighbour, RowTransfer};
 use crate::options::{DepthSampling, FilterOptions, FusionMethod};
 
-/// Where a neighbour sees some hypotheses, and what it has there: the first two steps.
+/// Where a neighbour sees some hypotheses. The lanes come first, for they fill lines of the cache.
 #[derive(Clone, Copy, Default)]
-#[repr(align(64))]
+#[repr(C, align(64))]
 pub(super) struct Place {
     /// Depth of the hypothesis in the neighbour, and its inverse.
     pub z: [f32; LANES],
     inverse: [f32; LANES],
-    /// The upper left of the four pixels around, and how far the place lies from it.
-    corner: [i32; LANES],
+    /// The upper left of the four pixels around, and how far the place lies from it; 0 and no numbers where none of
+    /// the four is of the map.
+    pub column: [i32; LANES],
+    pub row: [i32; LANES],
     fx: [f32; LANES],
     fy: [f32; LANES],
-    /// The depths of the two upper and the two lower ones of the four pixels.
-    upper: Pairs,
-    lower: Pairs,
     /// Lanes of which all four pixels are of the map, lane k as bit k, and lanes of which some are.
-    inside: u32,
-    border: u32,
+    pub inside: u32,
+    pub border: u32,
+    /// Where all the places are, if they are close together.
+    pub window: Option<Window>,
 }
 
-/// What a neighbour makes of some hypotheses, and its pixels there: the next two steps.
+/// What a neighbour makes of some hypotheses. The lanes come first, for they fill lines of the cache.
 #[derive(Clone, Copy, Default)]
-#[repr(align(64))]
-pub(crate) struct Pixel {
+#[repr(C, align(64))]
+pub(crate) struct Answer {
     /// Depth of the reference that the neighbour's depth amounts to; 0 where it disagrees.
     pub depth: [f32; LANES],
     /// With [`FusionMethod::Dynamic`], the least n whose thresholds it meets.
     pub level: [f32; LANES],
-    /// The neighbour's nearest pixel.
-    pub index: [i32; LANES],
-    /// Four bytes with its colour are read from here on; they move down by so many bits.
-    pub color_at: [i32; LANES],
-    pub color_shift: [i32; LANES],
-    pub color: [i32; LANES],
-    pub confidence: [f32; LANES],
+    /// The neighbour's nearest pixel; the first where it disagrees.
+    pub column: [i32; LANES],
+    pub row: [i32; LANES],
+}
+
+/// The options, as the comparison needs them.
+#[derive(Clone, Copy)]
+pub(super) struct Limits {
+    sampling: DepthSampling,
+    is_dynamic: bool,
+    /// The reprojection error allowed, or with [`FusionMethod::Dynamic`] a pixel, both squared: in pixels of the map.
+    squared_px: f32,
+    relative_depth: f32,
+}
+
+impl Limits {
+    /// Those of `options`.
+    pub fn of(options: &FilterOptions) -> Self {
+        let is_dynamic = options.method == FusionMethod::Dynamic;
+        let px = if is_dynamic { 1.0 } else { options.max_reprojection_px } * options.network_pixel;
+        let relative_depth = options.max_relative_depth;
+        Self { sampling: options.sampling, is_dynamic, squared_px: px * px, relative_depth }
+    }
 }
 
 /// Projects the hypotheses in columns `x` of a row with depths `d` into a neighbour.
@@ -60,178 +79,107 @@ pub(super) unsafe fn project<L: Lanes>(
     (x, d): (L::F, L::F),
     place: &mut Place,
 ) {
-    let zero = L::splat(0.0);
     let z = transferred::<L>(transfer, 2, x, d);
     let inverse = L::div(L::splat(1.0), z);
     let u = L::mul(transferred::<L>(transfer, 0, x, d), inverse);
     let v = L::mul(transferred::<L>(transfer, 1, x, d), inverse);
-    // All four pixels around are pixels of the map, or some are. At 0 exactly it is the border's turn.
-    let in_front = L::less(zero, z);
-    let inside = L::and(in_front, within::<L>([u, v], 0.0, neighbour.size, -1.0));
-    let (column, row) = (L::truncate(u), L::truncate(v));
-    let corner = L::add_i(L::mul_i(row, L::splat_i(neighbour.size[0])), column);
-    let (mut fx, mut fy) = (L::sub(u, L::to_float(column)), L::sub(v, L::to_float(row)));
+    let (left, top) = (L::floor(u), L::floor(v));
+    let (column, row) = (L::truncate(left), L::truncate(top));
+    let (mut fx, fy) = (L::sub(u, left), L::sub(v, top));
+    let in_front = L::less(L::splat(0.0), z);
+    let [columns, rows] = neighbour.squares;
+    let inside = L::and(in_front, L::and(L::below(column, columns), L::below(row, rows)));
+    let mut somewhere = inside;
     place.inside = L::bits(inside);
     place.border = 0;
     if place.inside != (1 << LANES) - 1 {
-        let touching = L::and(in_front, within::<L>([u, v], -1.0, neighbour.size, 0.0));
-        place.border = L::bits(L::but_not(touching, inside));
-        // The border's turn comes later; what is no number agrees with nothing.
-        fx = L::select(inside, fx, L::select(touching, u, L::splat(f32::NAN)));
-        fy = L::select(inside, fy, v);
+        let one = L::splat_i(1);
+        let (right, below) = (L::add_i(column, one), L::add_i(row, one));
+        let [columns, rows] = neighbour.touching_squares;
+        somewhere = L::and(in_front, L::and(L::below(right, columns), L::below(below, rows)));
+        place.border = L::bits(L::but_not(somewhere, inside));
+        // What is no number agrees with nothing.
+        fx = L::select(somewhere, fx, L::splat(f32::NAN));
     }
     place.z = L::store(z);
     place.inverse = L::store(inverse);
-    place.corner = L::store_i(L::only_i(inside, corner));
+    place.column = L::store_i(L::only_i(somewhere, column));
+    place.row = L::store_i(L::only_i(somewhere, row));
     (place.fx, place.fy) = (L::store(fx), L::store(fy));
 }
 
-/// Fetches the depths of a neighbour at the places of hypotheses.
+/// Has the processor fetch the rows of a neighbour that the next rows of the reference will ask for, beyond `place`.
+///
+/// It does not foresee that by itself for all rasters of all neighbours. Confidences and colours are fetched two rows
+/// ahead, depths a row more, for they are read of the row below, too.
 ///
 /// # Safety
-/// As [`Lanes`]; `place` comes from [`project`] into this neighbour, and its depths were not fetched yet.
+/// As [`Lanes`].
 #[inline(always)]
-pub(super) unsafe fn fetch_depths<L: Lanes>(neighbour: &Neighbour<'_>, place: &mut Place) {
-    if place.inside != 0 {
-        let columns = neighbour.size[0] as usize;
-        let (from, to) = (neighbour.depth.as_ptr(), (&raw mut place.upper, &raw mut place.lower));
-        for k in 0..LANES {
-            // SAFETY: the corner is inside, so the next pixel and those below are of the map; or it is 0, and the map
-            // has two rows and columns, since some lane is inside. Pairs hold as many as there are lanes.
-            debug_assert!(place.corner[k] as u32 as usize + columns + 1 < neighbour.depth.len());
-            let upper = from.add(place.corner[k] as u32 as usize);
-            copy_pair(upper, to.0.cast::<u64>().add(pair_of_lane(k)));
-            copy_pair(upper.add(columns), to.1.cast::<u64>().add(pair_of_lane(k)));
-        }
-        // The rows of the reference that come will ask for what lies in the rows beyond these here, which the processor
-        // does not foresee for all neighbours by itself: confidences and colours are fetched two rows ahead, depths
-        // a row more, for they are read of the row below, too.
-        let band = place.corner[0] as isize + 2 * neighbour.next_row;
-        for ahead in [band, band + LANES as isize] {
-            L::prefetch(from.wrapping_offset(ahead + neighbour.next_row));
-            L::prefetch(neighbour.confidence.as_ptr().wrapping_offset(ahead));
-            L::prefetch(neighbour.color.as_ptr().wrapping_offset(ahead));
-        }
-    }
-    if place.border != 0 {
-        fetch_border(neighbour, place);
-    }
-}
-
-/// Volatile, lest the compiler make hardware's gathers of many copies: they take longer.
-///
-/// # Safety
-/// Two floats can be read, and written.
-#[inline(always)]
-unsafe fn copy_pair(from: *const f32, to: *mut u64) {
-    to.write_volatile(from.cast::<u64>().read_unaligned());
-}
-
-/// The same for lanes at the border: pixels outside count as 0.
-#[cold]
-fn fetch_border(neighbour: &Neighbour<'_>, place: &mut Place) {
-    for k in (0..LANES).filter(|k| place.border >> k & 1 == 1) {
-        let (x, y) = (place.fx[k].floor(), place.fy[k].floor());
-        (place.fx[k], place.fy[k]) = (place.fx[k] - x, place.fy[k] - y);
-        // A negative index wraps to one that no raster has.
-        let depth = |dx: i64, dy: i64| {
-            neighbour.map.depth.get((x as i64 + dx) as usize, (y as i64 + dy) as usize).unwrap_or(0.0)
-        };
-        place.upper.0[pair_of_lane(k)] = [depth(0, 0), depth(1, 0)];
-        place.lower.0[pair_of_lane(k)] = [depth(0, 1), depth(1, 1)];
-        // The corner from which the nearest pixel of the map is reached as from any other.
-        let [columns, rows] = neighbour.size;
-        let (right, down) = (i32::from(place.fx[k] > 0.5), i32::from(place.fy[k] > 0.5));
-        let nearest = |position: i32, size: i32| position.min(size - 1).max(0);
-        let pixel = nearest(y as i32 + down, rows) * columns + nearest(x as i32 + right, columns);
-        place.corner[k] = pixel - right - down * columns;
+pub(super) unsafe fn fetch_ahead<L: Lanes>(neighbour: &Neighbour<'_>, place: &Place) {
+    let first = place.row[0] as isize * neighbour.size[0] as isize + place.column[0] as isize;
+    let band = first + 2 * neighbour.next_row;
+    for ahead in [band, band + LANES as isize] {
+        L::prefetch(neighbour.depth.as_ptr().wrapping_offset(ahead + neighbour.next_row));
+        L::prefetch(neighbour.confidence.as_ptr().wrapping_offset(ahead));
+        L::prefetch(neighbour.color.as_ptr().wrapping_offset(ahead));
     }
 }
 
 /// Compares what a neighbour sees with the hypotheses in columns `x` with depths `d`.
 ///
 /// # Safety
-/// As [`Lanes`]; `place` comes from [`fetch_depths`] with this neighbour.
+/// As [`Lanes`]; `place` comes from [`project`] into this neighbour, and its window is around it.
 #[inline(always)]
 pub(super) unsafe fn compare<L: Lanes>(
     neighbour: &Neighbour<'_>,
     transfer: &RowTransfer,
-    options: &FilterOptions,
+    limits: Limits,
     (x, d): (L::F, L::F),
     place: &Place,
-    pixel: &mut Pixel,
+    answer: &mut Answer,
 ) {
-    let (zero, half) = (L::splat(0.0), L::splat(0.5));
-    let ((a, b), (c, e)) = (L::load_pairs(&place.upper), L::load_pairs(&place.lower));
+    let (zero, half, one) = (L::splat(0.0), L::splat(0.5), L::splat_i(1));
+    let corners = match place.window {
+        Some(window) => window.corners::<L>(neighbour, place),
+        None => places::corners::<L>(neighbour, place),
+    };
     let (fx, fy) = (L::load(&place.fx), L::load(&place.fy));
-    let seen = match options.sampling {
-        DepthSampling::Bilinear => bilinear::<L>([a, b, c, e], fx, fy),
-        DepthSampling::Continuous => continuous::<L>([a, b, c, e], fx, fy, options.max_relative_depth),
+    let seen = match limits.sampling {
+        DepthSampling::Bilinear => bilinear::<L>(corners, fx, fy),
+        DepthSampling::Continuous => continuous::<L>(corners, fx, fy, limits.relative_depth),
     };
     let q = L::mul_sub_from(seen, L::load(&place.inverse), L::splat(1.0));
-    let [centre_x, centre_z] = transfer.centre;
-    let difference = L::mul(q, L::sub(L::splat(centre_z), d));
+    let difference = L::mul(q, L::sub(L::splat(transfer.centre[1]), d));
     let depth = L::add(d, difference);
-    // Pixels of the reference, times its depth there.
-    let across = L::mul(q, L::mul_sub_from(x, L::splat(centre_z), L::splat(centre_x)));
-    let along = L::mul(q, L::splat(transfer.centre_beside_row));
-    let squared = L::mul_add(across, across, L::mul(along, along));
+    // Pixels of the reference, times its depth there, squared.
+    let beside = L::mul_sub_from(x, L::splat(transfer.centre[1]), L::splat(transfer.centre[0]));
+    let squared_distance = L::mul_add(beside, beside, L::splat(transfer.squared_beside_row));
+    let squared = L::mul(L::mul(q, q), squared_distance);
+    let squared_depth = L::mul(depth, depth);
     let in_front = L::and(L::less(zero, depth), L::less(zero, seen));
-    let agrees = if options.method == FusionMethod::Dynamic {
-        let most = L::mul(L::splat(options.network_pixel), depth);
-        let squared = L::div(squared, L::mul(most, most));
-        pixel.level = L::store(level::<L>(squared, L::div(L::abs(difference), d)));
+    let agrees = if limits.is_dynamic {
+        let squared_px = L::div(squared, L::mul(squared_depth, L::splat(limits.squared_px)));
+        answer.level = L::store(level::<L>(squared_px, L::div(L::abs(difference), d)));
         in_front
     } else {
-        let most = L::mul(L::splat(options.max_reprojection_px * options.network_pixel), depth);
-        let near = L::less(squared, L::mul(most, most));
-        let alike = L::less(L::abs(difference), L::mul(L::splat(options.max_relative_depth), d));
+        let near = L::less(squared, L::mul(squared_depth, L::splat(limits.squared_px)));
+        let alike = L::less(L::abs(difference), L::mul(d, L::splat(limits.relative_depth)));
         L::and(in_front, L::and(near, alike))
     };
-    pixel.depth = L::store(L::only(agrees, depth));
-    let columns = L::splat_i(neighbour.size[0]);
-    let right = L::only_i(L::less(half, fx), L::splat_i(1));
-    let down = L::only_i(L::less(half, fy), columns);
-    // Of lanes that disagree nothing will be asked.
-    let index = L::only_i(agrees, L::add_i(L::add_i(L::load_i(&place.corner), right), down));
-    let color = L::add_i(L::add_i(index, index), index);
-    // Four bytes are read: those of the last pixel with the one before.
-    let color_at = L::min_i(color, L::splat_i((3 * neighbour.color.len() as i32 - 4).max(-1)));
-    let beyond = L::sub_i(color, color_at);
-    pixel.index = L::store_i(index);
-    pixel.color_at = L::store_i(color_at);
-    pixel.color_shift = L::store_i(L::mul_i(beyond, L::splat_i(8)));
-}
-
-/// Fetches colours and confidences of a neighbour's nearest pixels.
-///
-/// # Safety
-/// `pixel` comes from [`compare`] with this neighbour.
-#[inline(always)]
-#[expect(clippy::cast_ptr_alignment, reason = "they are read as what they are")]
-pub(super) unsafe fn fetch_pixels(neighbour: &Neighbour<'_>, pixel: &mut Pixel) {
-    if neighbour.color.len() < 2 {
-        return fetch_only_pixel(neighbour, pixel);
-    }
-    let (color, confidence) = (neighbour.color.as_ptr().cast::<u8>(), neighbour.confidence.as_ptr());
-    for k in 0..LANES {
-        // SAFETY: the index is a pixel of the map, whose rasters have one size, and its colour is among four bytes that
-        // are, for there are two pixels. Volatile as pairs are.
-        debug_assert!((pixel.index[k] as u32 as usize) < neighbour.confidence.len());
-        debug_assert!(pixel.color_at[k] as u32 as usize + 4 <= 3 * neighbour.color.len());
-        let color = color.add(pixel.color_at[k] as u32 as usize).cast::<i32>();
-        (&raw mut pixel.color[k]).write_volatile(i32::from_le(color.read_unaligned()));
-        let confidence = confidence.add(pixel.index[k] as u32 as usize);
-        (&raw mut pixel.confidence[k]).write_volatile(confidence.read());
-    }
-}
-
-/// The same of a map with a single pixel: it has one byte less than are read.
-#[cold]
-fn fetch_only_pixel(neighbour: &Neighbour<'_>, pixel: &mut Pixel) {
-    let [r, g, b] = neighbour.color.first().copied().unwrap_or_default();
-    pixel.color = [i32::from_le_bytes([0, r, g, b]); LANES];
-    pixel.confidence = [neighbour.confidence.first().copied().unwrap_or_default(); LANES];
+    answer.depth = L::store(L::only(agrees, depth));
+    // The nearest pixel; of lanes that disagree nothing will be asked.
+    let column = L::add_i(L::load_i(&place.column), L::only_i(L::less(half, fx), one));
+    let row = L::add_i(L::load_i(&place.row), L::only_i(L::less(half, fy), one));
+    let (column, row) = if place.border == 0 {
+        (column, row)
+    } else {
+        let [last_column, last_row] = [L::splat_i(neighbour.size[0] - 1), L::splat_i(neighbour.size[1] - 1)];
+        let zero = L::splat_i(0);
+        (L::max_i(zero, L::min_i(column, last_column)), L::max_i(zero, L::min_i(row, last_row)))
+    };
+    answer.column = L::store_i(L::only_i(agrees, column));
+    answer.row = L::store_i(L::only_i(agrees, row));
 }
 
 // Closures are not compiled for the instructions of the function around them; these are.
@@ -242,15 +190,6 @@ unsafe fn transferred<L: Lanes>(transfer: &RowTransfer, axis: usize, x: L::F, d:
     let RowTransfer { along, start, shift, .. } = transfer;
     let at_depth_1 = L::mul_add(x, L::splat(along[axis]), L::splat(start[axis]));
     L::mul_add(at_depth_1, d, L::splat(shift[axis]))
-}
-
-/// Whether column and row lie beyond `least` and before the size plus `beyond`.
-#[inline(always)]
-unsafe fn within<L: Lanes>([u, v]: [L::F; 2], least: f32, size: [i32; 2], beyond: f32) -> L::M {
-    let least = L::splat(least);
-    let columns = L::and(L::less(least, u), L::less(u, L::splat(size[0] as f32 + beyond)));
-    let rows = L::and(L::less(least, v), L::less(v, L::splat(size[1] as f32 + beyond)));
-    L::and(columns, rows)
 }
 
 /// Bilinear over the four corners, whatever they hold.

@@ -4,7 +4,7 @@
 #[allow(clippy::wildcard_imports, reason = "the intrinsics have a namespace of their own")]
 use std::arch::x86_64::*;
 
-use super::lanes::{LANES, Lanes, Pairs};
+use super::lanes::{LANES, Lanes};
 
 /// 256-bit registers, two of them for a vector.
 pub(crate) struct Avx2;
@@ -131,6 +131,10 @@ impl Lanes for Avx2 {
         both!(_mm256_min_epi32; a, b)
     }
     #[inline(always)]
+    unsafe fn max_i(a: Self::I, b: Self::I) -> Self::I {
+        both!(_mm256_max_epi32; a, b)
+    }
+    #[inline(always)]
     unsafe fn or_i(a: Self::I, b: Self::I) -> Self::I {
         both!(_mm256_or_si256; a, b)
     }
@@ -159,14 +163,52 @@ impl Lanes for Avx2 {
         both!(_mm256_cvtepi32_ps; v)
     }
     #[inline(always)]
-    unsafe fn load_pairs(from: &Pairs) -> (Self::F, Self::F) {
-        let from = from.0.as_ptr().cast::<f32>();
-        let first = [_mm256_load_ps(from), _mm256_load_ps(from.add(HALF))];
-        let second = [_mm256_load_ps(from.add(2 * HALF)), _mm256_load_ps(from.add(3 * HALF))];
+    unsafe fn below(a: Self::I, limit: i32) -> Self::M {
+        let limit = [_mm256_set1_epi32(limit); 2];
+        let is_beyond = Self::equal(both!(_mm256_max_epu32; a, limit), a);
+        Self::but_not(Self::equal(a, a), is_beyond)
+    }
+    #[inline(always)]
+    unsafe fn equal(a: Self::I, b: Self::I) -> Self::M {
+        both!(_mm256_castsi256_ps; both!(_mm256_cmpeq_epi32; a, b))
+    }
+    #[inline(always)]
+    unsafe fn select_i(m: Self::M, a: Self::I, b: Self::I) -> Self::I {
+        both!(_mm256_blendv_epi8; b, a, both!(_mm256_castps_si256; m))
+    }
+    // Single copies: hardware's gathers take longer. They are volatile, lest the compiler make gathers of them.
+    #[inline(always)]
+    unsafe fn pairs(from: *const f32, at: Self::I) -> (Self::F, Self::F) {
+        // Two lanes of each four lie in the first half, for shuffles work within quarters.
+        let mut pairs = [[0_u64; HALF]; 2];
+        for (k, at) in Self::store_i(at).into_iter().enumerate() {
+            let to = &raw mut pairs[k % 4 / 2][k / 4 * 2 + k % 2];
+            to.write_volatile(from.add(at as usize).cast::<u64>().read_unaligned());
+        }
+        let [first, second] = pairs.map(|half| {
+            let half = half.as_ptr().cast::<f32>();
+            [_mm256_loadu_ps(half), _mm256_loadu_ps(half.add(HALF))]
+        });
         (
             both!(_mm256_shuffle_ps::<0b10_00_10_00>; first, second),
             both!(_mm256_shuffle_ps::<0b11_01_11_01>; first, second),
         )
+    }
+    #[inline(always)]
+    unsafe fn gather(from: *const f32, at: Self::I) -> Self::F {
+        let mut values = [0.0; LANES];
+        for (value, at) in values.iter_mut().zip(Self::store_i(at)) {
+            (&raw mut *value).write_volatile(from.add(at as usize).read());
+        }
+        Self::load(&values)
+    }
+    #[inline(always)]
+    unsafe fn gather_bytes(from: *const u8, at: Self::I) -> Self::I {
+        let mut values = [0; LANES];
+        for (value, at) in values.iter_mut().zip(Self::store_i(at)) {
+            (&raw mut *value).write_volatile(from.add(at as usize).cast::<i32>().read_unaligned());
+        }
+        Self::load_i(&values)
     }
     #[inline(always)]
     unsafe fn prefetch<T>(place: *const T) {

@@ -4,13 +4,13 @@
 #[allow(clippy::wildcard_imports, reason = "the intrinsics have a namespace of their own")]
 use std::arch::x86_64::*;
 
-use super::lanes::{LANES, Lanes, Pairs};
+use super::lanes::{LANES, Lanes};
 
 /// 512-bit registers, with masks.
 pub(crate) struct Avx512;
 
 /// # Safety
-/// The processor has AVX-512 F, BW, DQ and VL.
+/// The processor has AVX-512 F, BW, DQ, VL and VBMI.
 impl Lanes for Avx512 {
     type F = __m512;
     type I = __m512i;
@@ -121,6 +121,10 @@ impl Lanes for Avx512 {
         _mm512_min_epi32(a, b)
     }
     #[inline(always)]
+    unsafe fn max_i(a: __m512i, b: __m512i) -> __m512i {
+        _mm512_max_epi32(a, b)
+    }
+    #[inline(always)]
     unsafe fn or_i(a: __m512i, b: __m512i) -> __m512i {
         _mm512_or_si512(a, b)
     }
@@ -149,10 +153,52 @@ impl Lanes for Avx512 {
         _mm512_cvtepi32_ps(v)
     }
     #[inline(always)]
-    unsafe fn load_pairs(from: &Pairs) -> (__m512, __m512) {
-        let from = from.0.as_ptr().cast::<f32>();
-        let (first, second) = (_mm512_load_ps(from), _mm512_load_ps(from.add(LANES)));
-        (_mm512_shuffle_ps::<0b10_00_10_00>(first, second), _mm512_shuffle_ps::<0b11_01_11_01>(first, second))
+    unsafe fn below(a: __m512i, limit: i32) -> __mmask16 {
+        _mm512_cmplt_epu32_mask(a, _mm512_set1_epi32(limit))
+    }
+    #[inline(always)]
+    unsafe fn equal(a: __m512i, b: __m512i) -> __mmask16 {
+        _mm512_cmpeq_epi32_mask(a, b)
+    }
+    #[inline(always)]
+    unsafe fn select_i(m: __mmask16, a: __m512i, b: __m512i) -> __m512i {
+        _mm512_mask_blend_epi32(m, b, a)
+    }
+
+    const PICKS: bool = true;
+    #[inline(always)]
+    unsafe fn pick(window: *const f32, at: __m512i) -> __m512 {
+        let (first, second) = (_mm512_loadu_ps(window), _mm512_loadu_ps(window.add(LANES)));
+        _mm512_permutex2var_ps(first, at, second)
+    }
+    #[inline(always)]
+    unsafe fn pick_color(window: *const [u8; 3], at: __m512i) -> __m512i {
+        // Of 96 bytes the first 64 and the last 64; colour 16 and those behind it are taken from the latter.
+        let bytes = window.cast::<u8>();
+        let (first, second) = (_mm512_loadu_si512(bytes.cast()), _mm512_loadu_si512(bytes.add(32).cast()));
+        let late = _mm512_slli_epi32::<1>(_mm512_and_si512(at, _mm512_set1_epi32(16)));
+        let at = _mm512_and_si512(at, _mm512_set1_epi32(31));
+        let red = _mm512_add_epi32(late, _mm512_add_epi32(at, _mm512_slli_epi32::<1>(at)));
+        let each = _mm512_or_si512(red, _mm512_slli_epi32::<8>(red));
+        let each = _mm512_or_si512(each, _mm512_slli_epi32::<16>(red));
+        _mm512_permutex2var_epi8(first, _mm512_add_epi32(each, _mm512_set1_epi32(0x0002_0100)), second)
+    }
+    #[inline(always)]
+    unsafe fn pairs(from: *const f32, at: __m512i) -> (__m512, __m512) {
+        let (low, high) = (_mm512_castsi512_si256(at), _mm512_extracti64x4_epi64::<1>(at));
+        let low = _mm512_castpd_ps(_mm512_i32gather_pd::<4>(low, from.cast()));
+        let high = _mm512_castpd_ps(_mm512_i32gather_pd::<4>(high, from.cast()));
+        let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+        let odd = _mm512_or_si512(even, _mm512_set1_epi32(1));
+        (_mm512_permutex2var_ps(low, even, high), _mm512_permutex2var_ps(low, odd, high))
+    }
+    #[inline(always)]
+    unsafe fn gather(from: *const f32, at: __m512i) -> __m512 {
+        _mm512_i32gather_ps::<4>(at, from)
+    }
+    #[inline(always)]
+    unsafe fn gather_bytes(from: *const u8, at: __m512i) -> __m512i {
+        _mm512_i32gather_epi32::<1>(at, from.cast())
     }
     #[inline(always)]
     unsafe fn prefetch<T>(place: *const T) {

@@ -6,6 +6,8 @@
 
 /// Lanes of a vector.
 pub(crate) const LANES: usize = 16;
+/// Columns of a window that values are picked from.
+pub(crate) const WINDOW_COLUMNS: i32 = 32;
 
 /// Operations on sixteen lanes.
 ///
@@ -53,6 +55,7 @@ pub(crate) trait Lanes {
     unsafe fn add_i(a: Self::I, b: Self::I) -> Self::I;
     unsafe fn mul_i(a: Self::I, b: Self::I) -> Self::I;
     unsafe fn min_i(a: Self::I, b: Self::I) -> Self::I;
+    unsafe fn max_i(a: Self::I, b: Self::I) -> Self::I;
     unsafe fn or_i(a: Self::I, b: Self::I) -> Self::I;
     unsafe fn only_i(m: Self::M, v: Self::I) -> Self::I;
     unsafe fn sub_i(a: Self::I, b: Self::I) -> Self::I;
@@ -63,22 +66,68 @@ pub(crate) trait Lanes {
     unsafe fn truncate(v: Self::F) -> Self::I;
     unsafe fn to_float(v: Self::I) -> Self::F;
 
-    /// The first and the second values of [`Pairs`].
-    unsafe fn load_pairs(from: &Pairs) -> (Self::F, Self::F);
+    /// Whether `0 <= a < limit`; the limit is not negative.
+    unsafe fn below(a: Self::I, limit: i32) -> Self::M;
+    unsafe fn equal(a: Self::I, b: Self::I) -> Self::M;
+    /// `a` where `m` says so, else `b`.
+    unsafe fn select_i(m: Self::M, a: Self::I, b: Self::I) -> Self::I;
+
+    /// The values at `at` from `from` on, and those behind them.
+    #[inline(always)]
+    unsafe fn pairs(from: *const f32, at: Self::I) -> (Self::F, Self::F) {
+        // SAFETY: the caller vouches for the processor and for the values.
+        unsafe { (Self::gather(from, at), Self::gather(from.add(1), at)) }
+    }
+    /// The values at `at` from `from` on.
+    #[inline(always)]
+    unsafe fn gather(from: *const f32, at: Self::I) -> Self::F {
+        // SAFETY: as above.
+        unsafe {
+            let values = Self::store_i(at).map(|at| from.add(at as usize).read());
+            Self::load(&values)
+        }
+    }
+    /// The four bytes each, the lowest first, at `at` from `from` on.
+    #[inline(always)]
+    unsafe fn gather_bytes(from: *const u8, at: Self::I) -> Self::I {
+        // SAFETY: as above.
+        unsafe {
+            let bytes = Self::store_i(at).map(|at| from.add(at as usize).cast::<[u8; 4]>().read());
+            Self::load_i(&bytes.map(i32::from_le_bytes))
+        }
+    }
+
+    /// Whether [`Lanes::pick`] and [`Lanes::pick_color`] are faster than a copy for each lane.
+    const PICKS: bool = false;
+    /// Values of the [`WINDOW_COLUMNS`] that can be read from `window` on: in each lane the one at `at`, modulo their
+    /// number.
+    #[inline(always)]
+    unsafe fn pick(window: *const f32, at: Self::I) -> Self::F {
+        // SAFETY: the caller vouches for the processor and for the values.
+        unsafe {
+            let mut picked = [0.0; LANES];
+            for (value, at) in picked.iter_mut().zip(Self::store_i(at)) {
+                *value = window.add(at.rem_euclid(WINDOW_COLUMNS) as usize).read();
+            }
+            Self::load(&picked)
+        }
+    }
+    /// The same of colours; the fourth byte of each is any.
+    #[inline(always)]
+    unsafe fn pick_color(window: *const [u8; 3], at: Self::I) -> Self::I {
+        // SAFETY: as above.
+        unsafe {
+            let mut picked = [0; LANES];
+            for (color, at) in picked.iter_mut().zip(Self::store_i(at)) {
+                let [r, g, b] = window.add(at.rem_euclid(WINDOW_COLUMNS) as usize).read();
+                *color = i32::from_le_bytes([r, g, b, 0]);
+            }
+            Self::load_i(&picked)
+        }
+    }
+
     /// Has the processor fetch a place, if it is one, into its second cache.
     unsafe fn prefetch<T>(place: *const T);
-}
-
-/// Two values for each lane, that of lane k at [`pair_of_lane`]: so that shuffles within a quarter of the widest
-/// register tell them apart.
-#[derive(Clone, Copy, Default)]
-#[repr(align(64))]
-pub(crate) struct Pairs(pub [[f32; 2]; LANES]);
-
-/// Two lanes of each four lie in the first half.
-#[inline(always)]
-pub(crate) const fn pair_of_lane(lane: usize) -> usize {
-    lane / 4 * 2 + lane % 2 + if lane % 4 < 2 { 0 } else { LANES / 2 }
 }
 
 /// Arrays, for every processor.
@@ -197,6 +246,10 @@ impl Lanes for Portable {
         each(a, b, i32::min)
     }
     #[inline(always)]
+    unsafe fn max_i(a: Self::I, b: Self::I) -> Self::I {
+        each(a, b, i32::max)
+    }
+    #[inline(always)]
     unsafe fn or_i(a: Self::I, b: Self::I) -> Self::I {
         each(a, b, |a, b| a | b)
     }
@@ -225,9 +278,16 @@ impl Lanes for Portable {
         v.map(|v| v as f32)
     }
     #[inline(always)]
-    unsafe fn load_pairs(from: &Pairs) -> (Self::F, Self::F) {
-        let of = |which: usize| std::array::from_fn(|k| from.0[pair_of_lane(k)][which]);
-        (of(0), of(1))
+    unsafe fn below(a: Self::I, limit: i32) -> Self::M {
+        a.map(|a| 0 <= a && a < limit)
+    }
+    #[inline(always)]
+    unsafe fn equal(a: Self::I, b: Self::I) -> Self::M {
+        each(a, b, |a, b| a == b)
+    }
+    #[inline(always)]
+    unsafe fn select_i(m: Self::M, a: Self::I, b: Self::I) -> Self::I {
+        std::array::from_fn(|k| if m[k] { a[k] } else { b[k] })
     }
     #[inline(always)]
     unsafe fn prefetch<T>(_: *const T) {}

@@ -17,6 +17,8 @@ mod avx2;
 mod avx512;
 mod lanes;
 mod merge;
+mod places;
+mod window;
 
 use planesweep_scene::DepthMap;
 
@@ -24,10 +26,11 @@ use crate::dynamic::settle;
 use crate::geometric::{Neighbour, RowTransfer};
 use crate::hypotheses::{Block, HypothesisRow};
 use crate::options::{FilterOptions, FusionMethod};
-pub(crate) use agree::Pixel;
-use agree::{Place, compare, fetch_depths, fetch_pixels, project};
+pub(crate) use agree::Answer;
+use agree::{Limits, Place, compare, fetch_ahead, project};
 pub(crate) use lanes::{LANES, Lanes, Portable};
-use merge::Sums;
+use merge::{Means, Sums, Votes};
+use window::Window;
 
 /// The instructions that the kernel may use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,6 +63,7 @@ impl Level {
                 && is_x86_feature_detected!("avx512bw")
                 && is_x86_feature_detected!("avx512dq")
                 && is_x86_feature_detected!("avx512vl")
+                && is_x86_feature_detected!("avx512vbmi")
                 && is_x86_feature_detected!("fma")
             {
                 levels.push(Self::Avx512);
@@ -92,10 +96,10 @@ pub(crate) struct OutputRow<'a> {
 #[derive(Default)]
 pub(crate) struct Scratch {
     transfers: Vec<RowTransfer>,
-    /// Of each neighbour, for this block and for the next.
+    /// Of each neighbour, for the block at hand and for the next.
     places: Vec<Place>,
-    pixels: Vec<Pixel>,
-    /// How many neighbours have each level of [`Pixel::level`].
+    answers: Vec<Answer>,
+    /// How many neighbours have each level of [`Answer::level`].
     having: Vec<u32>,
 }
 
@@ -122,7 +126,7 @@ pub(crate) fn filter_row(
 }
 
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,fma")]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vbmi,fma")]
 fn with_avx512(
     input: &Input<'_>,
     y: usize,
@@ -158,46 +162,48 @@ unsafe fn blocks<L: Lanes>(
     out: &mut OutputRow<'_>,
 ) -> usize {
     let Input { neighbours, options, .. } = *input;
-    let Scratch { transfers, places, pixels, having } = scratch;
+    let Scratch { transfers, places, answers, having } = scratch;
     places.resize(2 * neighbours.len(), Place::default());
-    pixels.resize(neighbours.len(), Pixel::default());
+    answers.resize(neighbours.len(), Answer::default());
     let (mut places, mut next_places) = places.split_at_mut(neighbours.len());
+    let limits = Limits::of(options);
     let mut kept = 0;
-    for block in 0..row.blocks() {
-        // SAFETY: the caller vouches for the processor; places and pixels come from their neighbours.
+    for (block, next) in row.blocks().iter().zip(1..) {
+        // SAFETY: the caller vouches for the processor; places and answers are those of their neighbours.
         kept += unsafe {
             // A block ahead, so that nothing waits for the places; and each step for all neighbours, so that the
             // processor works on several of them at once.
-            if block == 0 {
-                project_block::<L>(neighbours, transfers, &row.block(0), places);
+            if next == 1 {
+                project_block::<L>(neighbours, transfers, block, places);
             }
-            if block + 1 < row.blocks() {
-                project_block::<L>(neighbours, transfers, &row.block(block + 1), next_places);
+            if let Some(next) = row.blocks().get(next) {
+                project_block::<L>(neighbours, transfers, next, next_places);
             }
-            let block = row.block(block);
-            let (x, d) = (L::load(block.columns), L::load(block.depths));
-            for (neighbour, place) in neighbours.iter().zip(&mut *places) {
-                fetch_depths::<L>(neighbour, place);
-            }
-            for (((neighbour, transfer), place), pixel) in
-                neighbours.iter().zip(&*transfers).zip(&*places).zip(&mut *pixels)
+            let (x, d) = hypotheses::<L>(block);
+            for (((neighbour, transfer), place), answer) in
+                neighbours.iter().zip(&*transfers).zip(&*places).zip(&mut *answers)
             {
-                compare::<L>(neighbour, transfer, options, (x, d), place, pixel);
+                compare::<L>(neighbour, transfer, limits, (x, d), place, answer);
             }
             if options.method == FusionMethod::Dynamic {
-                settle(pixels, having, options.min_views.saturating_sub(1));
+                settle(answers, having, options.min_views.saturating_sub(1));
             }
-            for (neighbour, pixel) in neighbours.iter().zip(&mut *pixels) {
-                fetch_pixels(neighbour, pixel);
+            let votes = Votes::<L>::count(block, answers);
+            write_views(block, &L::store_i(L::min_i(L::truncate(votes.count), L::splat_i(255))), out.views);
+            // Without any view there is no mean. Beyond the end of a block nothing agrees.
+            let least = options.min_views.max(1) as f32;
+            let kept_here = L::bits(L::less(L::splat(least - 0.5), votes.count));
+            if kept_here != 0 {
+                let mut sums = Sums::<L>::of_reference(input, y, block);
+                for (neighbour, (place, answer)) in neighbours.iter().zip(places.iter().zip(&*answers)) {
+                    let agrees = L::less(L::splat(0.0), L::load(&answer.depth));
+                    if L::bits(agrees) & kept_here != 0 {
+                        sums = sums.and(neighbour, options.min_confidence, d, (place, answer));
+                    }
+                }
+                write_means(block, kept_here, &sums.means(&votes), out);
             }
-            let mut sums = Sums::<L>::of_reference(input, y, &block);
-            for ((index, neighbour), (place, pixel)) in
-                neighbours.iter().enumerate().zip(places.iter().zip(&*pixels))
-            {
-                let agrees = L::less(L::splat(0.0), L::load(&pixel.depth));
-                sums.add((index, neighbour), options.min_confidence, (d, agrees), (place, pixel));
-            }
-            write::<L>(&sums, &block, options, out)
+            kept_here.count_ones() as usize
         };
         std::mem::swap(&mut places, &mut next_places);
     }
@@ -210,48 +216,45 @@ unsafe fn blocks<L: Lanes>(
 unsafe fn project_block<L: Lanes>(
     neighbours: &[Neighbour<'_>],
     transfers: &[RowTransfer],
-    block: &Block<'_>,
+    block: &Block,
     places: &mut [Place],
 ) {
     // SAFETY: the caller vouches for the processor.
     unsafe {
-        let hypotheses = (L::load(block.columns), L::load(block.depths));
-        for ((neighbour, transfer), place) in neighbours.iter().zip(transfers).zip(places) {
+        let hypotheses = hypotheses::<L>(block);
+        for ((neighbour, transfer), place) in neighbours.iter().zip(transfers).zip(&mut *places) {
             project::<L>(neighbour, transfer, hypotheses, place);
+        }
+        for (neighbour, place) in neighbours.iter().zip(places) {
+            place.window = Window::around::<L>(neighbour, place);
+            fetch_ahead::<L>(neighbour, place);
         }
     }
 }
 
-/// Writes how many views agree with a block's hypotheses, and what enough views agree with; returns how many
-/// those are.
+/// Columns and depths of a block.
 ///
 /// # Safety
 /// As [`Lanes`].
 #[inline(always)]
-unsafe fn write<L: Lanes>(
-    sums: &Sums<L>,
-    block: &Block<'_>,
-    options: &FilterOptions,
-    out: &mut OutputRow<'_>,
-) -> usize {
-    // Without any view there is no mean.
-    let least = options.min_views.max(1) as f32;
+unsafe fn hypotheses<L: Lanes>(block: &Block) -> (L::F, L::F) {
     // SAFETY: the caller vouches for the processor.
-    let (bits, means) = unsafe {
-        let columns = &block.columns[..block.count];
-        for (x, count) in columns.iter().zip(L::store(sums.count())) {
-            out.views[*x as usize] = count.min(255.0) as u8;
-        }
-        // Beyond the end of a row nothing agrees.
-        let kept = L::bits(L::less(L::splat(least - 0.5), sums.count()));
-        if kept == 0 {
-            return 0;
-        }
-        (kept, sums.means())
-    };
-    let columns = &block.columns[..block.count];
-    for (k, x) in columns.iter().enumerate().filter(|(k, _)| bits >> k & 1 == 1) {
-        let x = *x as usize;
+    unsafe { (L::to_float(L::load_i(&block.columns)), L::load(&block.depths)) }
+}
+
+/// Writes how many views agree with a block's hypotheses.
+#[inline(always)]
+fn write_views(block: &Block, count: &[i32; LANES], views: &mut [u8]) {
+    for (x, count) in block.columns.iter().zip(count).take(block.count) {
+        views[*x as usize] = *count as u8;
+    }
+}
+
+/// Writes the hypotheses of a block that are kept.
+#[inline(always)]
+fn write_means(block: &Block, kept: u32, means: &Means, out: &mut OutputRow<'_>) {
+    for k in (0..LANES).filter(|k| kept >> k & 1 == 1) {
+        let x = block.columns[k] as usize;
         out.depth[x] = means.depth[k];
         let [r, g, b, _] = means.color[k].to_le_bytes();
         out.color[x] = [r, g, b];
@@ -260,5 +263,4 @@ unsafe fn write<L: Lanes>(
         out.agreeing[x] = low | high << 32;
         out.owns[x] = means.owns >> k & 1 == 1;
     }
-    bits.count_ones() as usize
 }

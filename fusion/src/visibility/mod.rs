@@ -14,7 +14,7 @@ use planesweep_scene::DepthMap;
 use rayon::prelude::*;
 
 use crate::geometric::{Neighbour, RowTransfer};
-use crate::hypotheses::HypothesisRow;
+use crate::hypotheses::{Hypothesis, HypothesisRow};
 use crate::options::{FilterOptions, FusionMethod};
 use render::{Rendered, render};
 
@@ -67,7 +67,7 @@ impl<'a> Candidates<'a> {
         let Scratch { candidates, transfers } = scratch;
         transfers.clear();
         transfers.extend(self.neighbours.iter().map(|neighbour| neighbour.row_transfer(y)));
-        row.clear(self.reference.width());
+        row.clear();
         let mut counts = RowCounts::default();
         for x in 0..self.reference.width() {
             let (depth, confidence) = (self.reference.depth.at(x, y), self.reference.confidence.at(x, y));
@@ -86,7 +86,8 @@ impl<'a> Candidates<'a> {
             if let Some(chosen) = chosen {
                 let agrees =
                     |own: &Candidate| (own.depth - chosen).abs() < self.options.max_relative_depth * chosen;
-                row.push_if(true, x, chosen, own.filter(agrees).map_or(0.0, |own| own.depth));
+                let own = own.filter(agrees).map_or(0.0, |own| own.depth);
+                row.push(Hypothesis { column: x as i32, depth: chosen, own });
             }
         }
         row.end();

@@ -109,7 +109,7 @@ fn choose(depths: &[(f32, f32)], method: FusionMethod) -> Option<f32> {
     let options = FilterOptions { method, min_confidence: 0.5, ..FilterOptions::default() };
     let mut row = HypothesisRow::default();
     Candidates::new(&maps[0], &neighbours, &options).choose(0, &mut Scratch::default(), &mut row);
-    row.iter().next().map(|(_, depth, _)| depth)
+    row.blocks().first().map(|block| block.depths[0])
 }
 
 #[test]
