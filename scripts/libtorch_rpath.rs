@@ -11,11 +11,15 @@ fn main() {
     if let Some(folder) = env::var_os("LIBTORCH").map(PathBuf::from) {
         let folder = folder.canonicalize().unwrap_or(folder);
         let libraries = folder.join("lib");
+        // The folder, not the one file: where that is missing, a file would count as changed with every build, and one
+        // that comes out of an archive later is as old as it was in there.
+        println!("cargo:rerun-if-changed={}", libraries.display());
         println!("cargo:rustc-link-arg=-Wl,-rpath,{}", libraries.display());
         // Nobody refers to it by a symbol, so the linker would leave it out: loaded, it makes itself known.
         let cuda = libraries.join("libtorch_cuda.so");
         if cuda.exists() {
-            println!("cargo:rustc-link-arg=-Wl,--no-as-needed,{}", cuda.display());
+            // Libraries that come after it are left out as before.
+            println!("cargo:rustc-link-arg=-Wl,--push-state,--no-as-needed,{},--pop-state", cuda.display());
         }
     }
 }
