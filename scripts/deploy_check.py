@@ -1,13 +1,16 @@
-"""Checks the Kubernetes manifests against the published schemas, strictly, and prints one line per manifest.
+"""Checks the Kubernetes manifests against the published schemas, strictly, and prints one line per manifest and one
+for what each container runs.
 
     python scripts/deploy_check.py deploy/kubernetes/base deploy/kubernetes/gpu
 
 Each folder is a kustomization; resources of folders that it builds on are read, too, and its patches are merged into
-them as Kubernetes merges: lists of named things by name, other lists as a whole. What does not fit is named on
-stderr, with exit status 1. Needs kubernetes-validate, which brings the schemas along, and PyYAML.
+them as Kubernetes merges: lists of named things by name, other lists as a whole. Beyond the schemas, each variable in
+a command must be one of its container, and each port of a network policy one of the pods that it is for. What does not
+fit is named on stderr, with exit status 1. Needs kubernetes-validate, which brings the schemas along, and PyYAML.
 """
 
 import pathlib
+import re
 import sys
 
 import kubernetes_validate
@@ -53,10 +56,46 @@ def build(folder):
     return built
 
 
+def pods(built):
+    """What pods are made from, by kind and name."""
+    return {key: document["spec"]["template"] for key, document in built.items() if "template" in document.get("spec", {})}
+
+
+def command(container):
+    return [*container.get("command", []), *container.get("args", [])]
+
+
+def loose_ends(built):
+    """What one manifest refers to and no manifest has; Kubernetes takes such a one as it is."""
+    for (kind, of), pod in pods(built).items():
+        for container in pod["spec"]["containers"]:
+            has = {variable["name"] for variable in container.get("env", [])}
+            for name in re.findall(r"\$\((\w+)\)", " ".join(command(container))):
+                if name not in has:
+                    yield f"{kind} {of}: no variable {name} for $({name})"
+    for (kind, of), policy in built.items():
+        if kind != "NetworkPolicy":
+            continue
+        labels = policy["spec"]["podSelector"]["matchLabels"].items()
+        chosen = [pod for pod in pods(built).values() if labels <= pod["metadata"]["labels"].items()]
+        containers = [container for pod in chosen for container in pod["spec"]["containers"]]
+        has = {port["containerPort"] for container in containers for port in container.get("ports", [])}
+        for port in (port["port"] for rule in policy["spec"]["ingress"] for port in rule["ports"]):
+            if port not in has:
+                yield f"{kind} {of}: none of its pods has port {port}"
+
+
 def main():
     failed = False
     for folder in map(pathlib.Path, sys.argv[1:]):
-        for (kind, of), document in build(folder).items():
+        built = build(folder)
+        for (kind, of), pod in pods(built).items():
+            for container in pod["spec"]["containers"]:
+                print(f"{folder.name}: {kind} {of} runs {' '.join(command(container))}")
+        for loose in loose_ends(built):
+            failed = True
+            print(f"{folder.name}: {loose}", file=sys.stderr)
+        for (kind, of), document in built.items():
             for version in VERSIONS:
                 try:
                     kubernetes_validate.validate(document, version, strict=True)

@@ -7,6 +7,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use planesweep_tests::{Bench, Running, Slurm, courtyard, free_port, program, wait_until};
+use serde_json::Value;
 
 /// How long a state may take to come; far above what it ever takes.
 const DEADLINE: Duration = Duration::from_mins(5);
@@ -36,6 +37,7 @@ fn wait_for(what: &str, slurm: &Slurm, folder: &Path, mut is_there: impl FnMut()
 #[test]
 fn jobs_of_slurm_survive_preemption_and_time_limit() {
     let Some(slurm) = Slurm::new("jobs_of_slurm_survive_preemption_and_time_limit") else { return };
+    let node = fs::read_to_string("/proc/sys/kernel/hostname").expect("a node has a name");
     let bench = Bench::new(|folder| courtyard(folder, 8, 320, 256));
     let _ = bench.reconstruct("calm", &[&SLOW[..], &["--workers", "2"]].concat()).expect_code(0);
 
@@ -46,10 +48,12 @@ fn jobs_of_slurm_survive_preemption_and_time_limit() {
     let binaries = program().parent().expect("a program lies in a folder");
     let path = [binaries.as_os_str(), std::env::var_os("PATH").unwrap_or_default().as_os_str()]
         .join(OsStr::new(":"));
-    let variables: [(&str, &OsStr); 4] = [
+    let variables: [(&str, &OsStr); 5] = [
         ("PLANESWEEP_SHARED", shared.as_ref()),
         ("PLANESWEEP_HOST", "127.0.0.1".as_ref()),
         ("PLANESWEEP_PORT", port.as_ref()),
+        // Workers say where they serve their maps.
+        ("PLANESWEEP_LOG", "info".as_ref()),
         ("PATH", &path),
     ];
     let coordinator = slurm.batch(folder, &["--partition=service", &sbatch("coordinator")], &variables);
@@ -85,6 +89,18 @@ fn jobs_of_slurm_survive_preemption_and_time_limit() {
     assert!(struck.stderr.contains("the coordinator is back"), "{}", struck.stderr);
     let cloud = bench.read("struck/cloud.ply");
     assert!(cloud.len() > 10_000 && cloud == bench.read("calm/cloud.ply"), "the clouds differ");
+
+    // Other nodes would find a worker by the name of its node, and its maps come from there.
+    for task in [0, 1] {
+        let log = log(task).expect("a job has a log");
+        let address = format!("maps are served at http://{}:", node.trim());
+        assert!(log.contains(&address), "no '{address}' in {log}");
+    }
+    let other = ["--depths", "64", "--device", "torch", "--token-file", &token];
+    let _ = bench.submit_to("other", &url, &other).wait().expect_code(0);
+    let report: Value = serde_json::from_slice(&bench.read("other/report.json")).expect("a report");
+    let ways = &report["maps_by_way"];
+    assert!(ways["by stream"].as_u64() > Some(0), "{ways}");
 
     // The end: the coordinator takes its workers along.
     slurm.ask("scancel", &["--batch", "--signal=INT", &coordinator]);

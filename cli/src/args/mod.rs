@@ -121,6 +121,20 @@ mod tests {
     }
 
     #[test]
+    fn what_a_script_lets_a_worker_listen_on_can_be_given_anew() {
+        let listens = |more: &[&str]| {
+            let script =
+                ["planesweep", "worker", "--coordinator", "http://head:7070", "--listen", "0.0.0.0:0"];
+            match Cli::try_parse_from(script.iter().chain(more)).expect("valid").command {
+                Command::Worker(args) => args.listen.to_string(),
+                other => panic!("parsed as {other:?}"),
+            }
+        };
+        assert_eq!(listens(&[]), "0.0.0.0:0");
+        assert_eq!(listens(&["--listen", "127.0.0.1:0"]), "127.0.0.1:0");
+    }
+
+    #[test]
     fn senseless_numbers_are_usage_errors() {
         let refused = |option: &str, value: &str| {
             let option = format!("{option}={value}");

@@ -33,8 +33,9 @@ pub struct WorkerArgs {
     #[arg(long, value_enum, default_value = "both")]
     pub role: RoleArg,
     /// Where other workers fetch the maps that this one has in memory, such as 10.0.0.2:7071; port 0 takes
-    /// a free one. Beyond this host a token is needed.
-    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:0")]
+    /// a free one, and 0.0.0.0 is found by the host's name. Beyond this host a token is needed. Given twice, the last
+    /// one counts.
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:0", overrides_with = "listen")]
     pub listen: SocketAddr,
     #[command(flatten)]
     pub tls: ServerTlsArgs,

@@ -55,6 +55,7 @@ pub(crate) async fn start_serving(
     } else {
         format!("{scheme}://{local}")
     };
+    tracing::info!("maps are served at {address}");
     let service = ExchangeServer::new(Service { maps, inbox, turns: Arc::new(Semaphore::new(MAX_FETCHES)) })
         .max_decoding_message_size(MAX_EXCHANGE_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_EXCHANGE_MESSAGE_BYTES);
