@@ -27,7 +27,7 @@ pub enum Code {
     Superseded,
     /// The other side cannot be reached, or is stopping.
     Unavailable,
-    /// The disk under the store has no room left.
+    /// The disk under the store, or under the ledger, has no room left.
     DiskFull,
     /// The ledger or the server failed.
     Internal,

@@ -88,7 +88,9 @@ fn a_full_disk_under_the_ledger_is_waited_for_until_there_is_room() {
     fill(Path::new(&folder));
     let workers = [cluster.worker(&ANALYTIC), cluster.worker(&ANALYTIC)];
     let message = format!("disk full at {ledger}");
-    let is_told = || workers.iter().all(|worker| worker.stderr().contains(&message));
+    // The kind, then the text: workers are told apart what is full from what is out of order.
+    let refusal = format!("no room: {message}");
+    let is_told = || workers.iter().all(|worker| worker.stderr().contains(&refusal));
     assert!(wait_until(DEADLINE, is_told), "{}\n{}", workers[0].stderr(), cluster.coordinator_stderr());
     assert!(cluster.coordinator_stderr().contains(&message) && struck.is_running());
     fs::remove_file(format!("{folder}/rest")).expect("there is room again");

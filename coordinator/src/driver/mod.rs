@@ -210,18 +210,19 @@ impl Driver {
 
     /// The step failed and was rolled back: what the ledger says holds.
     async fn recover(&mut self, error: &LedgerError) -> ServiceError {
-        let text = if error.is_disk_full() {
+        let (code, text) = if error.is_disk_full() {
             // Nothing is decided until it can be written down: workers keep what they have, and report again.
-            format!("disk full at {}; nothing goes on until there is room", self.ledger.place())
+            let place = self.ledger.place();
+            (Code::DiskFull, format!("disk full at {place}; nothing goes on until there is room"))
         } else {
-            with_causes(error)
+            (Code::Internal, with_causes(error))
         };
         tracing::error!(error = text, "the ledger failed; it is read anew");
         self.seen = None;
         if let Err(error) = self.catch_up().await {
             tracing::error!(error = with_causes(&error), "the ledger cannot be read");
         }
-        ServiceError::new(Code::Internal, text)
+        ServiceError::new(code, text)
     }
 
     fn fleet(&self) -> Fleet {

@@ -112,6 +112,7 @@ fn check_versions(caller: &str, code: &str, numerics: u32) -> Result<(), Service
 pub(crate) fn refusal(error: &LedgerError) -> ServiceError {
     let code = match error {
         LedgerError::NoSuchRun { .. } => Code::NotFound,
+        error if error.is_disk_full() => Code::DiskFull,
         _ => Code::Internal,
     };
     ServiceError::new(code, with_causes(error))
