@@ -20,8 +20,8 @@ const MAX_LEASE: Duration = Duration::from_hours(1);
 pub struct ServedStore {
     /// The store.
     pub store: Objects,
-    /// What tells it from all others.
-    pub identity: String,
+    /// What tells it from all others from now on if nothing does yet; must be unique.
+    pub new_identity: String,
 }
 
 /// What a coordinator is started with.

@@ -11,13 +11,14 @@ use planesweep_proto::{
     CheckToken, JobResult, Order, Refusals, RunStatus, ServerTls, ServiceError, StorePlace, SubmitHeader,
     Submitted, TlsError, check_jobs, probing_server, serve,
 };
+use planesweep_store::StoreError;
 use thiserror::Error;
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::service::interceptor::InterceptedService;
 
-use crate::config::{Config, ConfigError};
+use crate::config::{Config, ConfigError, ServedStore};
 use crate::driver::{Driver, DriverHandle, Message, Settings};
 use crate::ledger::{Ledger, LedgerError};
 use crate::service::{BlobService, Service, refusal};
@@ -34,6 +35,9 @@ pub enum StartError {
     /// The ledger is.
     #[error(transparent)]
     Ledger(#[from] LedgerError),
+    /// The store does not say who it is.
+    #[error(transparent)]
+    Store(#[from] StoreError),
     /// The certificate cannot be served with.
     #[error("cannot speak TLS")]
     Tls(#[from] TlsError),
@@ -64,11 +68,11 @@ impl Coordinator {
         let local_addr =
             listener.local_addr().map_err(|source| StartError::Listen { listen: config.listen, source })?;
         let ledger = Arc::new(Ledger::open(&config.ledger).await?);
-        if let Some(served) = &config.served {
-            ledger.tie_to_store(&served.identity, served.store.url()).await?;
-        }
+        let identity = match &config.served {
+            Some(served) => Some(tie(&ledger, served).await?),
+            None => None,
+        };
         let closed = CancellationToken::new();
-        let identity = config.served.as_ref().map(|served| served.identity.clone());
         let store = StorePlace { url: config.store_url.clone(), identity };
         let settings =
             Settings { lease: config.lease, report_interval: config.report_interval(), store: store.clone() };
@@ -97,6 +101,18 @@ impl Coordinator {
             server_task,
         })
     }
+}
+
+/// Ties the ledger to the store that is served; what that says of itself.
+async fn tie(ledger: &Ledger, served: &ServedStore) -> Result<String, StartError> {
+    let store = &served.store;
+    let identity = match ledger.store().await? {
+        // One that says nothing is another one, and stays as it is: it may be here by mistake.
+        Some(_) => store.said_identity().await?.unwrap_or_default(),
+        None => store.identity(&served.new_identity).await?,
+    };
+    ledger.tie_to_store(&identity, store.url()).await?;
+    Ok(identity)
 }
 
 /// A running coordinator. Dropped without [`Handle::shutdown`], it stops as if it were killed.

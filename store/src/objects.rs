@@ -82,7 +82,8 @@ impl Objects {
         written.map(|_| ()).map_err(|error| self.cannot_open(&error))
     }
 
-    async fn said_identity(&self) -> Result<Option<String>, StoreError> {
+    /// What tells this store from all others, if it has that yet.
+    pub async fn said_identity(&self) -> Result<Option<String>, StoreError> {
         let read = async { self.objects.get(&Path::from(IDENTITY)).await?.bytes().await };
         match read.await {
             // People write it with an editor or a shell, which end it with a line.

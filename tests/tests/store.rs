@@ -211,8 +211,10 @@ fn a_coordinator_whose_ledger_has_another_store_is_refused_and_told_what_to_do()
     let identity = fs::read_to_string(bench.path("store/identity")).expect("it says who it is");
     let advice = format!("write {identity} into the object \"identity\" of file://{other}");
     assert!(refused.stderr.contains(&advice), "{}", refused.stderr);
+    let said = format!("{other}/identity");
+    assert!(!fs::exists(&said).expect("it can be looked for"), "a store that is refused stays as it was");
     // As a shell writes it.
-    fs::write(format!("{other}/identity"), format!("{identity}\n")).expect("written");
+    fs::write(said, format!("{identity}\n")).expect("written");
     let _ = Cluster::start_on(&ledger, &other, Vec::new(), &[]).drain().wait().expect_code(0);
 }
 

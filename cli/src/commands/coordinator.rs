@@ -47,13 +47,12 @@ pub struct CoordinatorArgs {
 pub fn run(args: &CoordinatorArgs) -> Result<Outcome> {
     let store = Objects::open(&args.store)?;
     let runtime = tokio::runtime::Runtime::new().context("cannot start the runtime")?;
-    let nonce = unique().context("cannot make an identity for the store")?;
-    let identity = runtime.block_on(store.identity(&nonce))?;
+    let new_identity = unique().context("cannot make an identity for the store")?;
     let config = Config {
         listen: args.listen,
         lease: args.lease,
         token: args.token.read()?,
-        served: Some(ServedStore { store: store.clone(), identity }),
+        served: Some(ServedStore { store: store.clone(), new_identity }),
         tls: args.tls.read()?,
         ..Config::new(&*args.ledger, store.url())
     };

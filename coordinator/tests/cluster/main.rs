@@ -233,10 +233,10 @@ async fn a_run_submitted_alone_ends_the_others_and_cancelled_jobs_are_revoked(pl
 
 async fn a_ledger_has_one_store(place: Place) {
     let folder = tempfile::tempdir().expect("a folder");
-    let begin = async |store: &str, identity: &str| {
+    let begin = async |store: &str, new: &str| {
         let url = format!("file://{}", folder.path().join(store).display());
         let served =
-            ServedStore { store: Objects::open(&url).expect("a store"), identity: identity.to_owned() };
+            ServedStore { store: Objects::open(&url).expect("a store"), new_identity: new.to_owned() };
         Coordinator::start(Config { served: Some(served), ..config(&place) }).await
     };
     begin("a", "one").await.expect("the first store is taken").shutdown().await;
@@ -244,7 +244,12 @@ async fn a_ledger_has_one_store(place: Place) {
     let text = error.to_string();
     assert!(matches!(error, StartError::Ledger(LedgerError::OtherStore { .. })), "{text}");
     assert!(text.contains("write one into") && text.contains("/b"), "{text}");
+    let identity = folder.path().join("b/identity");
+    assert!(!identity.exists(), "a store that is refused stays as it was");
+    std::fs::write(&identity, "two").expect("written");
+    assert!(begin("b", "three").await.is_err(), "it is another one's");
     // It was moved, and coordinators without one of their own do not mind.
-    begin("b", "one").await.expect("the same store").shutdown().await;
+    std::fs::write(&identity, "one").expect("written");
+    begin("b", "three").await.expect("the same store").shutdown().await;
     start(&place).await.shutdown().await;
 }
