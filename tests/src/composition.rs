@@ -9,10 +9,11 @@ use tempfile::TempDir;
 use crate::containers::{Containers, is_made};
 
 const FILE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docker/compose.yaml");
-/// What the names of images begin with that stand in for those of a registry.
-const STAND_IN: &str = "planesweep-standin";
+/// For which images of a registry others stand in.
+const STAND_INS: [&str; 2] = ["postgres", "s3"];
 
-/// The file as it is, in a folder with the token and the settings that it asks for. What it started is removed with it.
+/// The file as it is, in a folder with the token and the settings that it asks for. What it started is removed with it,
+/// and so are the images that stand in for those of a registry.
 pub struct Composition<'a> {
     containers: &'a Containers,
     folder: TempDir,
@@ -28,16 +29,19 @@ impl<'a> Composition<'a> {
         scenes: &str,
         s3_server: &Path,
     ) -> Option<Self> {
-        let version = containers.script("docker_compose.sh").arg("version").output();
-        let mut standins = containers.script("docker_standins.sh");
-        let standins = standins.arg(image).arg(s3_server).arg(STAND_IN);
         let runs = |output: std::io::Result<Output>| is_made(test, &output.expect("a script starts"));
-        if !runs(version) || !runs(standins.output()) {
+        if !runs(containers.script("docker_compose.sh").arg("version").output()) {
             return None;
         }
-        let folder = tempfile::tempdir().expect("a temporary folder");
-        let write = |name: &str, text: &str| fs::write(folder.path().join(name), text).expect("written");
-        fs::copy(FILE, folder.path().join("compose.yaml")).expect("copied");
+        // From here on, what is made is removed.
+        let made = Self { containers, folder: tempfile::tempdir().expect("a temporary folder") };
+        let mut standins = containers.script("docker_standins.sh");
+        if !runs(standins.arg(image).arg(s3_server).arg(made.standin()).output()) {
+            return None;
+        }
+        let folder = made.folder.path();
+        let write = |name: &str, text: &str| fs::write(folder.join(name), text).expect("written");
+        fs::copy(FILE, folder.join("compose.yaml")).expect("copied");
         write("token", "s3cret\n");
         write(
             ".env",
@@ -46,16 +50,18 @@ impl<'a> Composition<'a> {
                  PLANESWEEP_PORT=\n"
             ),
         );
+        let images =
+            STAND_INS.map(|service| format!("  {service}: {{image: {}-{service}}}\n", made.standin()));
         // Beside the images: inference is slow, and workers are asked soon how they are.
         write(
             "standins.yaml",
             &format!(
-                "services:\n  postgres: {{image: {STAND_IN}-postgres}}\n  s3: {{image: {STAND_IN}-s3}}\n  \
-                 fuse: {{healthcheck: {{interval: 5s}}}}\n  \
-                 infer: {{healthcheck: {{interval: 5s}}, cpus: 0.5}}\n"
+                "services:\n{}  fuse: {{healthcheck: {{interval: 5s}}}}\n  \
+                 infer: {{healthcheck: {{interval: 5s}}, cpus: 0.5}}\n",
+                images.concat()
             ),
         );
-        Some(Self { containers, folder })
+        Some(made)
     }
 
     /// Runs `docker compose` with these arguments, which must succeed; its stdout.
@@ -80,6 +86,11 @@ impl<'a> Composition<'a> {
         self.containers.prefix()
     }
 
+    /// What the names of the images that stand in begin with: no other test has them.
+    pub fn standin(&self) -> String {
+        format!("{}-standin", self.project())
+    }
+
     /// The name of one of a service's containers; they are counted from 1.
     pub fn container(&self, service: &str, number: usize) -> String {
         format!("{}-{service}-{number}", self.project())
@@ -97,5 +108,8 @@ impl Drop for Composition<'_> {
             "--timeout",
             "1",
         ]);
+        for service in STAND_INS {
+            let _ = self.containers.try_docker(&["image", "rm", &format!("{}-{service}", self.standin())]);
+        }
     }
 }
