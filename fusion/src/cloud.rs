@@ -5,7 +5,7 @@ use planesweep_scene::Raster;
 use rayon::prelude::*;
 
 use crate::filter::FilteredMap;
-use crate::normals::normals;
+use crate::normals::Frame;
 
 /// A point of the dense cloud.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -27,27 +27,23 @@ pub struct Point {
 /// The points of the pixels of a filtered depth map that `emitted` marks (of its size; see
 /// [`emitted`](crate::emitted)), row by row from the top.
 pub fn emit(map: &FilteredMap, emitted: &Raster<bool>) -> Vec<Point> {
-    let normals = normals(&map.camera, &map.depth);
-    let rows: Vec<Vec<Point>> = (0..map.depth.height())
-        .into_par_iter()
-        .map(|y| {
-            let emitted = emitted.row(y).iter().enumerate().filter(|(_, emitted)| **emitted);
-            emitted
-                .map(|(x, _)| {
-                    let pixel = Point2::new(x as f64, y as f64);
-                    Point {
-                        position: map.camera.unproject(&pixel, map.depth.at(x, y) as f64).into(),
-                        normal: normals.at(x, y),
-                        color: map.color.at(x, y),
-                        confidence: map.confidence.at(x, y) as f32 / 255.0,
-                        views: map.views.at(x, y),
-                        seen_by: map.agreeing.at(x, y),
-                    }
-                })
-                .collect()
-        })
-        .collect();
-    rows.concat()
+    let frame = Frame { camera: &map.camera, depth: &map.depth };
+    let columns = map.depth.width();
+    let chosen = emitted.values().iter().enumerate().filter(|(_, emitted)| **emitted);
+    let chosen: Vec<usize> = chosen.map(|(index, _)| index).collect();
+    let point = |index: usize| {
+        let (x, y) = (index % columns, index / columns);
+        let pixel = Point2::new(x as f64, y as f64);
+        Point {
+            position: map.camera.unproject(&pixel, map.depth.at(x, y) as f64).into(),
+            normal: frame.world_normal(x, y),
+            color: map.color.at(x, y),
+            confidence: map.confidence.at(x, y) as f32 / 255.0,
+            views: map.views.at(x, y),
+            seen_by: map.agreeing.at(x, y),
+        }
+    };
+    chosen.into_par_iter().with_min_len(1 << 10).map(point).collect()
 }
 
 #[cfg(test)]

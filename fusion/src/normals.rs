@@ -20,8 +20,7 @@ pub fn normals(camera: &Camera, depth: &Raster<f32>) -> Raster<[f32; 3]> {
     normals.values_mut().par_chunks_mut(depth.width().max(1)).enumerate().for_each(|(y, row)| {
         for (x, normal) in row.iter_mut().enumerate() {
             if depth.at(x, y) > 0.0 {
-                let world = camera.pose.rotation.transpose() * frame.normal(x, y);
-                *normal = world.map(|n| n as f32).into();
+                *normal = frame.world_normal(x, y);
             }
         }
     });
@@ -29,12 +28,18 @@ pub fn normals(camera: &Camera, depth: &Raster<f32>) -> Raster<[f32; 3]> {
 }
 
 /// A depth map as points of its camera's frame.
-struct Frame<'a> {
-    camera: &'a Camera,
-    depth: &'a Raster<f32>,
+pub(crate) struct Frame<'a> {
+    pub camera: &'a Camera,
+    pub depth: &'a Raster<f32>,
 }
 
 impl Frame<'_> {
+    /// What [`normals`] has at a pixel with a depth.
+    pub fn world_normal(&self, x: usize, y: usize) -> [f32; 3] {
+        let world = self.camera.pose.rotation.transpose() * self.normal(x, y);
+        world.map(|n| n as f32).into()
+    }
+
     fn point(&self, x: usize, y: usize) -> Vector3<f64> {
         let depth = self.depth.at(x, y) as f64;
         self.camera.intrinsics.unproject(&Point2::new(x as f64, y as f64), depth).coords

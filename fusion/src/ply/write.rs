@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use planesweep_scene::Camera;
+use rayon::prelude::*;
 
 use super::PlyError;
 use crate::cloud::Point;
@@ -39,25 +40,37 @@ impl VertexFormat {
 
 /// The points as the file holds them, little-endian and one after the other.
 pub fn encode(points: &[Point], format: VertexFormat) -> Vec<u8> {
-    let mut bytes = Vec::with_capacity(points.len() * format.vertex_bytes());
-    for point in points {
-        for value in point.position {
-            if format.double {
-                bytes.extend_from_slice(&value.to_le_bytes());
-            } else {
-                bytes.extend_from_slice(&(value as f32).to_le_bytes());
-            }
-        }
-        for value in point.normal {
-            bytes.extend_from_slice(&value.to_le_bytes());
-        }
-        bytes.extend_from_slice(&point.color);
-        if format.quality {
-            bytes.extend_from_slice(&point.confidence.to_le_bytes());
-            bytes.push(point.views);
+    let mut bytes = vec![0; points.len() * format.vertex_bytes()];
+    let vertices = bytes.par_chunks_exact_mut(format.vertex_bytes());
+    vertices
+        .zip(points)
+        .with_min_len(1 << 12)
+        .for_each(|(vertex, point)| encode_point(point, format, vertex));
+    bytes
+}
+
+/// One point, into as many bytes as it takes.
+fn encode_point(point: &Point, format: VertexFormat, vertex: &mut [u8]) {
+    let mut at = 0;
+    let mut append = |bytes: &[u8]| {
+        vertex[at..at + bytes.len()].copy_from_slice(bytes);
+        at += bytes.len();
+    };
+    for value in point.position {
+        if format.double {
+            append(&value.to_le_bytes());
+        } else {
+            append(&(value as f32).to_le_bytes());
         }
     }
-    bytes
+    for value in point.normal {
+        append(&value.to_le_bytes());
+    }
+    append(&point.color);
+    if format.quality {
+        append(&point.confidence.to_le_bytes());
+        append(&[point.views]);
+    }
 }
 
 /// Writes a cloud piece by piece; the file appears under its name when [`PlyWriter::finish`] returns,
