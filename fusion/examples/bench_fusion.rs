@@ -5,7 +5,7 @@
 //! cargo run --release -p planesweep-fusion --example bench_fusion -- --twin python3 --runs 15
 //! ```
 //!
-//! `--width 288` runs the maps of that width alone, `--method dynamic` that method.
+//! `--width 288` runs one of the sizes alone, 96, 288 or 1152; `--method dynamic` that method.
 
 use std::fmt::Write as _;
 use std::fs;

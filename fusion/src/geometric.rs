@@ -49,8 +49,7 @@ impl<'a> Neighbour<'a> {
         let there = Transfer::between(reference, &map.camera);
         let (width, height) = (map.width(), map.height());
         let size = [width, height];
-        assert_eq!([map.confidence.width(), map.confidence.height()], size, "confidences of a map");
-        assert_eq!([map.color.width(), map.color.height()], size, "colours of a map");
+        assert_rasters_match(map);
         let is_small = width < MAX_SIDE && height < MAX_SIDE && map.depth.values().len() < MAX_PIXELS;
         let extent = if is_small { size.map(|side| side as i32) } else { [0; 2] };
         let next_row = if there.matrix[(1, 1)] < 0.0 { -(width as isize) } else { width as isize };
@@ -80,6 +79,17 @@ impl<'a> Neighbour<'a> {
     pub fn row_back(&self, y: usize) -> RowTransfer {
         self.back.of_row(y, &self.there)
     }
+}
+
+/// Makes sure of what the kernel does not check for each pixel.
+///
+/// # Panics
+/// When the map's rasters differ in size, or a row has so many pixels that their bytes are beyond an index of 32 bits.
+pub(crate) fn assert_rasters_match(map: &DepthMap) {
+    let size = [map.width(), map.height()];
+    assert_eq!([map.confidence.width(), map.confidence.height()], size, "confidences of a map");
+    assert_eq!([map.color.width(), map.color.height()], size, "colours of a map");
+    assert!(map.width() < MAX_PIXELS, "columns of a map");
 }
 
 /// From the pixels of one row of the reference to the pixels of a neighbour: the homogeneous pixel of column x

@@ -4,7 +4,7 @@ use crate::kernel::LANES;
 
 /// Depths of neighbouring pixels that differ by less, relatively, are taken for one surface.
 const ONE_SURFACE: f32 = 0.02;
-/// As many in a row that lie apart from the surface before make a surface.
+/// After as many in a row that lie apart from the surface before, the next one makes a surface.
 const NEXT_SURFACE: usize = 3;
 /// From the first column of a block to the first that is no longer of it, unless the columns are apart anyway.
 const MAX_COLUMNS: i32 = 24;

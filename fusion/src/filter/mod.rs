@@ -4,7 +4,7 @@ use planesweep_scene::{Camera, DepthMap, Raster};
 use rayon::prelude::*;
 
 use crate::funnel::Funnel;
-use crate::geometric::Neighbour;
+use crate::geometric::{Neighbour, assert_rasters_match};
 use crate::hypotheses::HypothesisRow;
 use crate::kernel::{self, Input, Level, OutputRow, filter_row};
 use crate::options::{FilterOptions, FusionMethod};
@@ -55,8 +55,19 @@ pub struct FilteredMap {
 /// Rows are computed in parallel; the result has the same bits for any number of threads.
 ///
 /// # Panics
-/// When the rasters of a map differ in size, which [`DepthMap::new`] refuses.
+/// When the rasters of a map differ in size, which [`DepthMap::new`] refuses, or it has 2^29 columns.
 pub fn filter(reference: &DepthMap, neighbours: &[&DepthMap], options: &FilterOptions) -> FilteredMap {
+    filter_with(Level::detect(), reference, neighbours, options)
+}
+
+/// The same with the instructions of `level`.
+fn filter_with(
+    level: Level,
+    reference: &DepthMap,
+    neighbours: &[&DepthMap],
+    options: &FilterOptions,
+) -> FilteredMap {
+    assert_rasters_match(reference);
     let (width, height) = (reference.width(), reference.height());
     let neighbours: Vec<_> = neighbours.iter().map(|map| Neighbour::new(&reference.camera, map)).collect();
     let candidates = match options.method {
@@ -65,7 +76,6 @@ pub fn filter(reference: &DepthMap, neighbours: &[&DepthMap], options: &FilterOp
             Some(Candidates::new(reference, &neighbours, options))
         }
     };
-    let level = Level::detect();
     let input = Input { reference, neighbours: &neighbours, options, level };
     let mut depth = Raster::filled(width, height, 0.0);
     let mut color = Raster::filled(width, height, [0; 3]);

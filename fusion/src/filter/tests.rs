@@ -324,6 +324,13 @@ proptest! {
         for (reference, neighbours) in [(&first, [&second, &sane]), (&sane, [&first, &second])] {
             let filtered = filter(reference, &neighbours, &options);
             prop_assert!(filtered.depth.values().iter().all(|d| d.is_finite() && *d >= 0.0));
+            for level in Level::available() {
+                let other = filter_with(level, reference, &neighbours, &options);
+                // Not the cameras, which may not equal themselves.
+                prop_assert!(other.depth == filtered.depth && other.color == filtered.color, "{:?}", level);
+                prop_assert!(other.confidence == filtered.confidence && other.owns == filtered.owns);
+                prop_assert!(other.views == filtered.views && other.agreeing == filtered.agreeing);
+            }
         }
     }
 }
@@ -365,35 +372,47 @@ fn wider_registers_change_no_bit() {
         camera.pose.translation = rotation * camera.pose.translation;
         noisy_map(camera, &noise)
     }));
-    let neighbours: Vec<_> = maps[1..].iter().map(|map| Neighbour::new(&maps[0].camera, map)).collect();
+    let neighbours: Vec<_> = maps[1..].iter().collect();
     for (method, sampling) in METHODS.into_iter().flat_map(|method| {
         [DepthSampling::Bilinear, DepthSampling::Continuous].map(|sampling| (method, sampling))
     }) {
         let options = FilterOptions { method, sampling, min_views: 2, ..FilterOptions::default() };
         let dispatched = filter_first(&maps, &options);
-        let candidates = matches!(method, FusionMethod::Visibility | FusionMethod::VisibilityConfidence)
-            .then(|| Candidates::new(&maps[0], &neighbours, &options));
-        let mut row = RowFilter::default();
-        for (level, y) in Level::available().into_iter().flat_map(|level| (0..43).map(move |y| (level, y))) {
-            let input = Input { reference: &maps[0], neighbours: &neighbours, options: &options, level };
-            let (mut depth, mut color, mut views) = ([0.0; 61], [[0; 3]; 61], [0; 61]);
-            let (mut confidence, mut agreeing, mut owns) = ([0; 61], [0; 61], [false; 61]);
-            let mut out = OutputRow {
-                depth: &mut depth,
-                color: &mut color,
-                views: &mut views,
-                confidence: &mut confidence,
-                agreeing: &mut agreeing,
-                owns: &mut owns,
-            };
-            row.run(&input, candidates.as_ref(), y, &mut out);
-            assert_eq!(depth, dispatched.depth.row(y));
-            assert_eq!(color, dispatched.color.row(y));
-            assert_eq!(views, dispatched.views.row(y));
-            assert_eq!(confidence, dispatched.confidence.row(y));
-            assert_eq!(agreeing, dispatched.agreeing.row(y));
-            assert_eq!(owns, dispatched.owns.row(y));
+        for level in Level::available() {
+            assert!(
+                filter_with(level, &maps[0], &neighbours, &options) == dispatched,
+                "{level:?}, {method:?}"
+            );
         }
         assert!(dispatched.funnel.geometric > 100, "{method:?}");
     }
+}
+
+#[test]
+fn maps_about_as_large_as_a_window_change_no_bit() {
+    let noise: Vec<_> = (0..991).map(|i| ((i as f32 * 0.3).sin(), 0.75 + (i as f32).sin() / 4.0)).collect();
+    let map = |x, (width, height)| noisy_map(camera_at(x, 0.1, width, height), &noise);
+    let sizes = [(32, 4), (31, 4), (32, 3), (33, 5), (20, 30), (64, 4)];
+    let neighbours: Vec<_> = sizes.into_iter().map(|size| map(0.1, size)).collect();
+    let neighbours: Vec<_> = neighbours.iter().collect();
+    for (width, min_views) in
+        [1, 2, 20, 31, 32, 33, 40].into_iter().flat_map(|width| [(width, 0), (width, 2)])
+    {
+        let reference = map(0.0, (width, 6));
+        let options = FilterOptions { min_views, ..FilterOptions::default() };
+        let best = filter(&reference, &neighbours, &options);
+        for level in Level::available() {
+            let filtered = filter_with(level, &reference, &neighbours, &options);
+            assert!(filtered == best, "{level:?}, {width} columns, {min_views} views");
+        }
+        assert!(best.funnel.geometric > 0 || width < 20);
+    }
+}
+
+#[test]
+#[should_panic(expected = "colours of a map")]
+fn a_reference_with_rasters_of_two_sizes_is_refused() {
+    let mut map = PLANE.map(camera_at(0.0, 0.0, 40, 8));
+    map.color = Raster::filled(0, 8, [0; 3]);
+    filter(&map, &[], &FilterOptions { min_views: 1, ..FilterOptions::default() });
 }

@@ -22,8 +22,8 @@ pub(super) struct Place {
     /// Depth of the hypothesis in the neighbour, and its inverse.
     pub z: [f32; LANES],
     inverse: [f32; LANES],
-    /// The upper left of the four pixels around, and how far the place lies from it; 0 and no numbers where none of
-    /// the four is of the map.
+    /// The upper left of the four pixels around, and how far the place lies from it; 0 and an `fx` that is no number
+    /// where none of the four is of the map.
     pub column: [i32; LANES],
     pub row: [i32; LANES],
     fx: [f32; LANES],
@@ -43,7 +43,7 @@ pub(crate) struct Answer {
     pub depth: [f32; LANES],
     /// With [`FusionMethod::Dynamic`], the least n whose thresholds it meets.
     pub level: [f32; LANES],
-    /// The neighbour's nearest pixel; the first where it disagrees.
+    /// The neighbour's nearest pixel; where it disagrees, any.
     pub column: [i32; LANES],
     pub row: [i32; LANES],
 }
@@ -86,6 +86,7 @@ pub(super) unsafe fn project<L: Lanes>(
     let (left, top) = (L::floor(u), L::floor(v));
     let (column, row) = (L::truncate(left), L::truncate(top));
     let (mut fx, fy) = (L::sub(u, left), L::sub(v, top));
+    // A lane whose u or v is no number may be anywhere: so are fx or fy then, and it agrees with nothing.
     let in_front = L::less(L::splat(0.0), z);
     let [columns, rows] = neighbour.squares;
     let inside = L::and(in_front, L::and(L::below(column, columns), L::below(row, rows)));
@@ -117,6 +118,9 @@ pub(super) unsafe fn project<L: Lanes>(
 /// As [`Lanes`].
 #[inline(always)]
 pub(super) unsafe fn fetch_ahead<L: Lanes>(neighbour: &Neighbour<'_>, place: &Place) {
+    if place.inside | place.border == 0 {
+        return;
+    }
     let first = place.row[0] as isize * neighbour.size[0] as isize + place.column[0] as isize;
     let band = first + 2 * neighbour.next_row;
     for ahead in [band, band + LANES as isize] {

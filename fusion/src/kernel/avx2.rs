@@ -180,15 +180,16 @@ impl Lanes for Avx2 {
     #[inline(always)]
     unsafe fn pairs(from: *const f32, at: Self::I) -> (Self::F, Self::F) {
         // Two lanes of each four lie in the first half, for shuffles work within quarters.
-        let mut pairs = [[0_u64; HALF]; 2];
-        for (k, at) in Self::store_i(at).into_iter().enumerate() {
-            let to = &raw mut pairs[k % 4 / 2][k / 4 * 2 + k % 2];
-            to.write_volatile(from.add(at as usize).cast::<u64>().read_unaligned());
+        let mut pairs = [[0.0_f32; 2]; LANES];
+        let at = Self::store_i(at);
+        for k in 0..LANES {
+            let place = k / 4 * 2 + k % 2 + if k % 4 < 2 { 0 } else { HALF };
+            let pair = from.add(at[k] as usize).cast::<[u32; 2]>().read();
+            pairs.as_mut_ptr().add(place).cast::<[u32; 2]>().write_volatile(pair);
         }
-        let [first, second] = pairs.map(|half| {
-            let half = half.as_ptr().cast::<f32>();
-            [_mm256_loadu_ps(half), _mm256_loadu_ps(half.add(HALF))]
-        });
+        let from = pairs.as_ptr().cast::<f32>();
+        let first = [_mm256_loadu_ps(from), _mm256_loadu_ps(from.add(HALF))];
+        let second = [_mm256_loadu_ps(from.add(2 * HALF)), _mm256_loadu_ps(from.add(3 * HALF))];
         (
             both!(_mm256_shuffle_ps::<0b10_00_10_00>; first, second),
             both!(_mm256_shuffle_ps::<0b11_01_11_01>; first, second),

@@ -13,7 +13,7 @@ pub(crate) const WINDOW_COLUMNS: i32 = 32;
 ///
 /// # Safety
 /// Of every method: the processor has the implementor's instructions. Methods are inlined into functions that enable
-/// them.
+/// them. Of those that read through a pointer: what they say that they read can be read; indices are not negative.
 pub(crate) trait Lanes {
     /// Floats.
     type F: Copy;
@@ -62,7 +62,7 @@ pub(crate) trait Lanes {
     unsafe fn and_i(a: Self::I, b: Self::I) -> Self::I;
     /// Bits move down by `by`, from 0 to 31.
     unsafe fn shift_down(v: Self::I, by: Self::I) -> Self::I;
-    /// Towards 0. What no `i32` holds becomes any integer.
+    /// Towards 0. What is too large or small becomes `i32::MIN` or `i32::MAX`, what is no number any integer.
     unsafe fn truncate(v: Self::F) -> Self::I;
     unsafe fn to_float(v: Self::I) -> Self::F;
 
@@ -291,4 +291,74 @@ impl Lanes for Portable {
     }
     #[inline(always)]
     unsafe fn prefetch<T>(_: *const T) {}
+}
+
+#[cfg(all(test, target_arch = "x86_64"))]
+mod tests {
+    use super::super::{Level, avx2::Avx2, avx512::Avx512};
+    use super::*;
+
+    /// What comes out of the operations that the levels implement in ways of their own.
+    fn outcomes<L: Lanes>(at: [i32; LANES], floats: [f32; LANES]) -> [[i32; LANES]; 12] {
+        let values: Vec<f32> = (0..200).map(|i| i as f32 + 0.5).collect();
+        let colors: Vec<[u8; 3]> = (0..64).map(|i| [i, 64 + i, 128 + i]).collect();
+        let bytes = colors.as_flattened();
+        let inside = at.map(|at| at.rem_euclid(150));
+        let as_bits = |v: L::F| unsafe { L::store(v) }.map(|v: f32| v.to_bits() as i32);
+        let as_numbers = |m: L::M| unsafe { L::store_i(L::only_i(m, L::splat_i(1))) };
+        // SAFETY: the caller asked the processor; 200 values, 64 colours and 192 bytes are there.
+        unsafe {
+            let (lanes, inside) = (L::load_i(&at), L::load_i(&inside));
+            let (first, second) = L::pairs(values.as_ptr(), inside);
+            let color = L::pick_color(colors.as_ptr(), lanes);
+            [
+                as_bits(L::pick(values.as_ptr(), lanes)),
+                L::store_i(L::and_i(color, L::splat_i(0x00FF_FFFF))),
+                as_bits(first),
+                as_bits(second),
+                as_bits(L::gather(values.as_ptr(), inside)),
+                L::store_i(L::gather_bytes(bytes.as_ptr(), inside)),
+                as_numbers(L::below(lanes, 0)),
+                as_numbers(L::below(lanes, 7)),
+                as_numbers(L::below(lanes, i32::MAX)),
+                as_numbers(L::equal(lanes, L::splat_i(3))),
+                L::store_i(L::max_i(lanes, L::splat_i(5))),
+                as_bits(L::floor(L::load(&floats))),
+            ]
+        }
+    }
+
+    #[test]
+    fn all_levels_do_the_same() {
+        for start in (-48..80).chain([i32::MIN, i32::MAX - 40]) {
+            let at = std::array::from_fn(|k| start.wrapping_add((k * k % 37) as i32));
+            let floats = std::array::from_fn(|k| start as f32 / 8.0 + k as f32 * 1.37);
+            let portable = outcomes::<Portable>(at, floats);
+            for level in Level::available() {
+                let outcomes = match level {
+                    Level::Avx512 => outcomes::<Avx512>(at, floats),
+                    Level::Avx2 => outcomes::<Avx2>(at, floats),
+                    Level::Portable => continue,
+                };
+                assert_eq!(outcomes, portable, "{level:?} from {start} on");
+            }
+        }
+    }
+
+    #[test]
+    fn what_no_integer_holds_lies_at_the_ends() {
+        let floats = [1e10, -1e10, f32::INFINITY, f32::NEG_INFINITY];
+        let floats = std::array::from_fn(|k| floats[k % 4]);
+        // SAFETY: the level was asked for.
+        let truncated = |level| unsafe {
+            match level {
+                Level::Avx512 => Avx512::store_i(Avx512::truncate(Avx512::load(&floats))),
+                Level::Avx2 => Avx2::store_i(Avx2::truncate(Avx2::load(&floats))),
+                Level::Portable => Portable::store_i(Portable::truncate(Portable::load(&floats))),
+            }
+        };
+        for level in Level::available() {
+            assert!(truncated(level).iter().all(|i| [i32::MIN, i32::MAX].contains(i)), "{level:?}");
+        }
+    }
 }

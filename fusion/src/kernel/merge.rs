@@ -66,7 +66,7 @@ impl<L: Lanes> Sums<L> {
     /// The reference's own, where it agrees with the hypotheses of `block` in row `y`.
     ///
     /// # Safety
-    /// As [`Lanes`]; the columns are of the reference.
+    /// As [`Lanes`]; the columns are of the reference, whose rasters have one size.
     #[inline(always)]
     pub unsafe fn of_reference(input: &Input<'_>, y: usize, block: &Block) -> Self {
         let own = L::load(&block.own);

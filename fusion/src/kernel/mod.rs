@@ -169,7 +169,8 @@ unsafe fn blocks<L: Lanes>(
     let limits = Limits::of(options);
     let mut kept = 0;
     for (block, next) in row.blocks().iter().zip(1..) {
-        // SAFETY: the caller vouches for the processor; places and answers are those of their neighbours.
+        // SAFETY: the caller vouches for the processor; places and answers are those of their neighbours, and rasters
+        // of a map have one size: the filter and `Neighbour::new` made sure.
         kept += unsafe {
             // A block ahead, so that nothing waits for the places; and each step for all neighbours, so that the
             // processor works on several of them at once.
@@ -197,6 +198,7 @@ unsafe fn blocks<L: Lanes>(
                 let mut sums = Sums::<L>::of_reference(input, y, block);
                 for (neighbour, (place, answer)) in neighbours.iter().zip(places.iter().zip(&*answers)) {
                     let agrees = L::less(L::splat(0.0), L::load(&answer.depth));
+                    // So its map has pixels to ask for.
                     if L::bits(agrees) & kept_here != 0 {
                         sums = sums.and(neighbour, options.min_confidence, d, (place, answer));
                     }

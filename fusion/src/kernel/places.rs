@@ -12,7 +12,8 @@ use crate::geometric::Neighbour;
 #[inline(always)]
 pub(super) unsafe fn corners<L: Lanes>(neighbour: &Neighbour<'_>, place: &Place) -> [L::F; 4] {
     if place.border != 0 {
-        return corners_with_border(neighbour, place).map(|lanes| L::load(&lanes));
+        let [a, b, c, d] = corners_with_border(neighbour, place);
+        return [L::load(&a), L::load(&b), L::load(&c), L::load(&d)];
     }
     if place.inside == 0 {
         return [L::splat(0.0); 4];
@@ -42,10 +43,10 @@ fn corners_with_border(neighbour: &Neighbour<'_>, place: &Place) -> [[f32; LANES
 /// Colours, their bytes the lowest three, and confidences of the neighbour's pixels.
 ///
 /// # Safety
-/// As [`Lanes`]; `answer` is this neighbour's.
+/// As [`Lanes`]; `answer` is this neighbour's, and it agrees with something: so its map has a pixel.
 #[inline(always)]
 pub(super) unsafe fn pixels<L: Lanes>(neighbour: &Neighbour<'_>, answer: &Answer) -> (L::I, L::F) {
-    // SAFETY: the pixels are of the map, whose rasters have one size.
+    // SAFETY: the pixels are of the map, the first one in lanes that disagree; its rasters have one size.
     let at = indices::<L>(neighbour, &answer.column, &answer.row);
     (gather_color::<L>(neighbour.color, at), L::gather(neighbour.confidence.as_ptr(), at))
 }

@@ -29,6 +29,7 @@ impl Window {
         if !L::PICKS || place.inside == 0 || place.border != 0 || columns < WINDOW_COLUMNS || rows < ROWS {
             return None;
         }
+        // The remainders spare a check of the index.
         let first = place.inside.trailing_zeros() as usize % LANES;
         let last = place.inside.ilog2() as usize % LANES;
         // In the middle between the first place and the last, and within the map.
