@@ -176,43 +176,34 @@ impl Lanes for Avx2 {
     unsafe fn select_i(m: Self::M, a: Self::I, b: Self::I) -> Self::I {
         both!(_mm256_blendv_epi8; b, a, both!(_mm256_castps_si256; m))
     }
-    // Single copies: hardware's gathers take longer. They are volatile, lest the compiler make gathers of them.
     #[inline(always)]
     unsafe fn pairs(from: *const f32, at: Self::I) -> (Self::F, Self::F) {
-        // Two lanes of each four lie in the first half, for shuffles work within quarters.
-        let mut pairs = [[0.0_f32; 2]; LANES];
-        let at = Self::store_i(at);
-        for k in 0..LANES {
-            let place = k / 4 * 2 + k % 2 + if k % 4 < 2 { 0 } else { HALF };
-            let pair = from.add(at[k] as usize).cast::<[u32; 2]>().read();
-            pairs.as_mut_ptr().add(place).cast::<[u32; 2]>().write_volatile(pair);
-        }
-        let from = pairs.as_ptr().cast::<f32>();
-        let first = [_mm256_loadu_ps(from), _mm256_loadu_ps(from.add(HALF))];
-        let second = [_mm256_loadu_ps(from.add(2 * HALF)), _mm256_loadu_ps(from.add(3 * HALF))];
-        (
-            both!(_mm256_shuffle_ps::<0b10_00_10_00>; first, second),
-            both!(_mm256_shuffle_ps::<0b11_01_11_01>; first, second),
-        )
+        let [(a, b), (c, d)] = [Self::eight_pairs(from, at[0]), Self::eight_pairs(from, at[1])];
+        ([a, c], [b, d])
     }
     #[inline(always)]
     unsafe fn gather(from: *const f32, at: Self::I) -> Self::F {
-        let mut values = [0.0; LANES];
-        for (value, at) in values.iter_mut().zip(Self::store_i(at)) {
-            (&raw mut *value).write_volatile(from.add(at as usize).read());
-        }
-        Self::load(&values)
+        [_mm256_i32gather_ps::<4>(from, at[0]), _mm256_i32gather_ps::<4>(from, at[1])]
     }
     #[inline(always)]
     unsafe fn gather_bytes(from: *const u8, at: Self::I) -> Self::I {
-        let mut values = [0; LANES];
-        for (value, at) in values.iter_mut().zip(Self::store_i(at)) {
-            (&raw mut *value).write_volatile(from.add(at as usize).cast::<i32>().read_unaligned());
-        }
-        Self::load_i(&values)
+        [_mm256_i32gather_epi32::<1>(from.cast(), at[0]), _mm256_i32gather_epi32::<1>(from.cast(), at[1])]
     }
     #[inline(always)]
     unsafe fn prefetch<T>(place: *const T) {
         _mm_prefetch::<_MM_HINT_T1>(place.cast());
+    }
+}
+
+impl Avx2 {
+    /// The values at `at` from `from` on, and those behind them.
+    #[inline(always)]
+    unsafe fn eight_pairs(from: *const f32, at: __m256i) -> (__m256, __m256) {
+        // Two lanes of each four come first, for shuffles work within quarters.
+        let at = _mm256_permute4x64_epi64::<0b11_01_10_00>(at);
+        let (first, second) = (_mm256_castsi256_si128(at), _mm256_extracti128_si256::<1>(at));
+        let first = _mm256_castpd_ps(_mm256_i32gather_pd::<4>(from.cast(), first));
+        let second = _mm256_castpd_ps(_mm256_i32gather_pd::<4>(from.cast(), second));
+        (_mm256_shuffle_ps::<0b10_00_10_00>(first, second), _mm256_shuffle_ps::<0b11_01_11_01>(first, second))
     }
 }
