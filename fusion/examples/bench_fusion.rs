@@ -23,6 +23,8 @@ use planesweep_fusion::{
 use planesweep_scene::{Camera, DepthMap, Intrinsics, Pose, Raster};
 
 const NEIGHBOURS: usize = 10;
+/// How long ours is timed in a turn.
+const AT_LEAST_MS: f64 = 20.0;
 /// Longer than the threads of numpy and OpenCV wait in loops.
 const IDLE: Duration = Duration::from_millis(200);
 const METHODS: [FusionMethod; 4] = [
@@ -124,15 +126,19 @@ fn against_twin(maps: &[DepthMap], python: &str, runs: usize) {
     let mut twin = Twin::start(python, folder.path());
     let (mut ours, mut theirs, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
     let (mut own_cpu, mut twin_cpu) = (0.0, 0.0);
-    let mut kept;
+    let mut kept = None;
     for _ in 0..runs {
         // Numpy's threads wait in loops for more to do, and would take a processor from us.
         sleep(IDLE);
-        // The first of two runs warms the caches that the other program emptied.
-        kept = Some(fuse(maps, FusionMethod::Consistency));
+        // The first run warms the caches that the other program emptied; then as many as take about as long as one of
+        // numpy's, whose threads are awake for most of its run, too.
+        let first = milliseconds(&mut kept, || fuse(maps, FusionMethod::Consistency));
+        let views = (AT_LEAST_MS / first).ceil().max(1.0);
         let before = cpu_milliseconds();
-        ours.push(milliseconds(&mut kept, || fuse(maps, FusionMethod::Consistency)));
-        own_cpu += cpu_milliseconds() - before;
+        let all =
+            (0..views as usize).map(|_| milliseconds(&mut kept, || fuse(maps, FusionMethod::Consistency)));
+        ours.push(all.sum::<f64>() / views);
+        own_cpu += (cpu_milliseconds() - before) / views;
         twin.run();
         let [wall, cpu] = twin.run();
         theirs.push(wall);
