@@ -6,7 +6,7 @@ use crate::kernel::LANES;
 const ONE_SURFACE: f32 = 0.02;
 /// After as many in a row that lie apart from the surface before, the next one makes a surface.
 const NEXT_SURFACE: usize = 3;
-/// From the first column of a block to the first that is no longer of it, unless the columns are apart anyway.
+/// From the first column of a block of one surface to the first that is no longer of it.
 const MAX_COLUMNS: i32 = 24;
 
 /// One of them.
@@ -26,6 +26,8 @@ pub(crate) struct Hypothesis {
 #[derive(Default)]
 pub(crate) struct HypothesisRow {
     blocks: Vec<Block>,
+    /// The block that is not full yet, and what lies apart, till the end.
+    near: Block,
     apart: Vec<Hypothesis>,
     /// How many there are.
     count: usize,
@@ -53,6 +55,20 @@ impl Default for Block {
 }
 
 impl Block {
+    /// Whether a hypothesis in that column may be added to those of one surface.
+    #[inline]
+    fn takes(&self, column: i32) -> bool {
+        self.count == 0 || self.count < LANES && column - self.columns[0] < MAX_COLUMNS
+    }
+
+    /// Fills the next lane; there is one.
+    #[inline]
+    fn push(&mut self, Hypothesis { column, depth, own }: Hypothesis) {
+        let lane = self.count % LANES;
+        (self.columns[lane], self.depths[lane], self.own[lane]) = (column, depth, own);
+        self.count += 1;
+    }
+
     /// Whether all hypotheses lie within so many columns.
     pub fn is_within(&self, columns: i32) -> bool {
         let last = self.columns[self.count.clamp(1, LANES) - 1];
@@ -65,7 +81,7 @@ impl HypothesisRow {
     pub fn clear(&mut self) {
         self.blocks.clear();
         self.apart.clear();
-        self.count = 0;
+        (self.near, self.count) = (Block::default(), 0);
     }
 
     /// Adds a hypothesis in a column behind all others.
@@ -78,36 +94,22 @@ impl HypothesisRow {
             self.apart.push(hypothesis);
         } else {
             (self.surface, self.since) = (depth, 0);
-            self.append(hypothesis, MAX_COLUMNS);
+            if !self.near.takes(hypothesis.column) {
+                self.blocks.push(std::mem::take(&mut self.near));
+            }
+            self.near.push(hypothesis);
         }
         self.count += 1;
     }
 
-    #[inline]
-    fn append(&mut self, hypothesis: Hypothesis, max_columns: i32) {
-        let Hypothesis { column, depth, own } = hypothesis;
-        let block = match self.blocks.last_mut() {
-            Some(block) if block.count < LANES && column - block.columns[0] < max_columns => block,
-            _ => {
-                self.blocks.push(Block::default());
-                self.blocks.last_mut().expect("just pushed")
-            }
-        };
-        let lane = block.count;
-        (block.columns[lane], block.depths[lane], block.own[lane]) = (column, depth, own);
-        block.count += 1;
-    }
-
-    /// Adds those that lie apart.
+    /// Ends the last block, and adds those that lie apart.
     pub fn end(&mut self) {
-        let apart = std::mem::take(&mut self.apart);
-        if !apart.is_empty() {
-            self.blocks.push(Block::default());
-        }
-        for hypothesis in &apart {
-            self.append(*hypothesis, i32::MAX);
-        }
-        self.apart = apart;
+        self.blocks.extend((self.near.count > 0).then(|| std::mem::take(&mut self.near)));
+        self.blocks.extend(self.apart.chunks(LANES).map(|apart| {
+            let mut block = Block::default();
+            apart.iter().for_each(|hypothesis| block.push(*hypothesis));
+            block
+        }));
     }
 
     /// How many hypotheses there are.
