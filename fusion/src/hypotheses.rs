@@ -107,7 +107,9 @@ impl HypothesisRow {
         self.blocks.extend((self.near.count > 0).then(|| std::mem::take(&mut self.near)));
         self.blocks.extend(self.apart.chunks(LANES).map(|apart| {
             let mut block = Block::default();
-            apart.iter().for_each(|hypothesis| block.push(*hypothesis));
+            for hypothesis in apart {
+                block.push(*hypothesis);
+            }
             block
         }));
     }
