@@ -103,64 +103,57 @@ pub(crate) struct Scratch {
     having: Vec<u32>,
 }
 
+/// A row of the reference, and what its filter works with.
+struct Row<'a, 'b> {
+    input: &'a Input<'a>,
+    y: usize,
+    hypotheses: &'a HypothesisRow,
+    scratch: &'a mut Scratch,
+    out: &'a mut OutputRow<'b>,
+}
+
 /// Tests the hypotheses of row `y`, writes what is left, and returns how many are kept.
 pub(crate) fn filter_row(
     input: &Input<'_>,
     y: usize,
-    row: &HypothesisRow,
+    hypotheses: &HypothesisRow,
     scratch: &mut Scratch,
     out: &mut OutputRow<'_>,
 ) -> usize {
     scratch.transfers.clear();
     scratch.transfers.extend(input.neighbours.iter().map(|neighbour| neighbour.row_transfer(y)));
+    let row = Row { input, y, hypotheses, scratch, out };
     match input.level {
         // SAFETY: levels come from `Level::available`, which asked the processor.
         #[cfg(target_arch = "x86_64")]
-        Level::Avx512 => unsafe { with_avx512(input, y, row, scratch, out) },
+        Level::Avx512 => unsafe { with_avx512(row) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        Level::Avx2 => unsafe { with_avx2(input, y, row, scratch, out) },
+        Level::Avx2 => unsafe { with_avx2(row) },
         // SAFETY: the portable lanes need nothing of the processor.
-        Level::Portable => unsafe { blocks::<Portable>(input, y, row, scratch, out) },
+        Level::Portable => unsafe { blocks::<Portable>(row) },
     }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vbmi,fma")]
-fn with_avx512(
-    input: &Input<'_>,
-    y: usize,
-    row: &HypothesisRow,
-    scratch: &mut Scratch,
-    out: &mut OutputRow<'_>,
-) -> usize {
+fn with_avx512(row: Row<'_, '_>) -> usize {
     // SAFETY: this function has the instructions.
-    unsafe { blocks::<avx512::Avx512>(input, y, row, scratch, out) }
+    unsafe { blocks::<avx512::Avx512>(row) }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
-fn with_avx2(
-    input: &Input<'_>,
-    y: usize,
-    row: &HypothesisRow,
-    scratch: &mut Scratch,
-    out: &mut OutputRow<'_>,
-) -> usize {
+fn with_avx2(row: Row<'_, '_>) -> usize {
     // SAFETY: as above.
-    unsafe { blocks::<avx2::Avx2>(input, y, row, scratch, out) }
+    unsafe { blocks::<avx2::Avx2>(row) }
 }
 
 /// # Safety
 /// As [`Lanes`].
 #[inline(always)]
-unsafe fn blocks<L: Lanes>(
-    input: &Input<'_>,
-    y: usize,
-    row: &HypothesisRow,
-    scratch: &mut Scratch,
-    out: &mut OutputRow<'_>,
-) -> usize {
+unsafe fn blocks<L: Lanes>(row: Row<'_, '_>) -> usize {
+    let Row { input, y, hypotheses: row, scratch, out } = row;
     let Input { neighbours, options, .. } = *input;
     let Scratch { transfers, places, answers, having } = scratch;
     places.resize(2 * neighbours.len(), Place::default());
