@@ -4,8 +4,9 @@ for what each container runs.
     python scripts/deploy_check.py deploy/kubernetes/base deploy/kubernetes/gpu
 
 Each folder is a kustomization; resources of folders that it builds on are read, too, and its patches are merged into
-them as Kubernetes merges: lists of named things by name, other lists as a whole. Beyond the schemas, each variable in
-a command must be one of its container, and each port of a network policy one of the pods that it is for. What does not
+them as Kubernetes merges: lists of named things by name, other lists as a whole; then it changes names and tags of
+images. Beyond the schemas, each of its images must be one of a container, each variable in a command one of its
+container, each port of a network policy one of the pods that it is for, and whom it lets in a pod, too. What does not
 fit is named on stderr, with exit status 1. Needs kubernetes-validate, which brings the schemas along, and PyYAML.
 """
 
@@ -41,19 +42,30 @@ def name(document):
 
 
 def build(folder):
-    """The documents of a kustomization by kind and name."""
+    """The documents of a kustomization by kind and name, and its images that no container has."""
     (kustomization,) = documents(folder / "kustomization.yaml")
-    built = {}
+    built, loose = {}, []
     for resource in kustomization["resources"]:
         path = folder / resource
-        more = build(path) if path.is_dir() else {name(document): document for document in documents(path)}
+        if path.is_dir():
+            more, of_base = build(path)
+            loose += of_base
+        else:
+            more = {name(document): document for document in documents(path)}
         if both := built.keys() & more.keys():
             raise ValueError(f"{folder}: more than one {both}")
         built |= more
     for patch in kustomization.get("patches", []):
         for document in documents(folder / patch["path"]):
             built[name(document)] = merged(built[name(document)], document)
-    return built
+    for change in kustomization.get("images", []):
+        chosen = [container for _, container in containers(built) if image(container)[0] == change["name"]]
+        for container in chosen:
+            is_now, tag = image(container)
+            container["image"] = f"{change.get('newName', is_now)}:{change.get('newTag', tag)}"
+        if not chosen:
+            loose.append(f"no container has the image {change['name']}")
+    return built, loose
 
 
 def pods(built):
@@ -61,38 +73,63 @@ def pods(built):
     return {key: document["spec"]["template"] for key, document in built.items() if "template" in document.get("spec", {})}
 
 
+def containers(built):
+    """Each container, with kind and name of what it is of."""
+    return [(key, container) for key, pod in pods(built).items() for container in pod["spec"]["containers"]]
+
+
+def image(container):
+    """Name and tag; a registry may have a port."""
+    name, tag = re.fullmatch(r"(.+?)(?::([^:/]+))?", container["image"]).groups()
+    return name, tag or "latest"
+
+
 def command(container):
     return [*container.get("command", []), *container.get("args", [])]
 
 
+def variables(container, built):
+    for variable in container.get("env", []):
+        yield variable["name"]
+    for source in container.get("envFrom", []):
+        yield from built.get(("ConfigMap", source.get("configMapRef", {}).get("name")), {}).get("data", {})
+
+
+def chosen(selector, built):
+    """The keys of the pods that a selector by labels chooses."""
+    labels = selector["podSelector"]["matchLabels"].items()
+    return [key for key, pod in pods(built).items() if labels <= pod["metadata"]["labels"].items()]
+
+
 def loose_ends(built):
     """What one manifest refers to and no manifest has; Kubernetes takes such a one as it is."""
-    for (kind, of), pod in pods(built).items():
-        for container in pod["spec"]["containers"]:
-            has = {variable["name"] for variable in container.get("env", [])}
-            for name in re.findall(r"\$\((\w+)\)", " ".join(command(container))):
-                if name not in has:
-                    yield f"{kind} {of}: no variable {name} for $({name})"
+    for (kind, of), container in containers(built):
+        has = set(variables(container, built))
+        for name in re.findall(r"\$\((\w+)\)", " ".join(command(container))):
+            if name not in has:
+                yield f"{kind} {of}: no variable {name} for $({name})"
     for (kind, of), policy in built.items():
         if kind != "NetworkPolicy":
             continue
-        labels = policy["spec"]["podSelector"]["matchLabels"].items()
-        chosen = [pod for pod in pods(built).values() if labels <= pod["metadata"]["labels"].items()]
-        containers = [container for pod in chosen for container in pod["spec"]["containers"]]
-        has = {port["containerPort"] for container in containers for port in container.get("ports", [])}
-        for port in (port["port"] for rule in policy["spec"]["ingress"] for port in rule["ports"]):
-            if port not in has:
-                yield f"{kind} {of}: none of its pods has port {port}"
+        guarded = chosen(policy["spec"], built)
+        ports = [port for key, container in containers(built) if key in guarded for port in container.get("ports", [])]
+        has = {port["containerPort"] for port in ports}
+        for rule in policy["spec"]["ingress"]:
+            for port in rule["ports"]:
+                if port["port"] not in has:
+                    yield f"{kind} {of}: none of its pods has port {port['port']}"
+            for source in rule["from"]:
+                if not chosen(source, built):
+                    yield f"{kind} {of}: lets in no pod, but {source['podSelector']['matchLabels']}"
 
 
 def main():
     failed = False
     for folder in map(pathlib.Path, sys.argv[1:]):
-        built = build(folder)
-        for (kind, of), pod in pods(built).items():
-            for container in pod["spec"]["containers"]:
-                print(f"{folder.name}: {kind} {of} runs {' '.join(command(container))}")
-        for loose in loose_ends(built):
+        built, images = build(folder)
+        for (kind, of), container in containers(built):
+            print(f"{folder.name}: {kind} {of} runs {container['image']}: {' '.join(command(container))}")
+        for loose in [*images, *loose_ends(built)]:
             failed = True
             print(f"{folder.name}: {loose}", file=sys.stderr)
         for (kind, of), document in built.items():
