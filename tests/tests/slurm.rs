@@ -3,6 +3,7 @@
 
 use std::ffi::OsStr;
 use std::fs;
+use std::net::ToSocketAddrs;
 use std::path::Path;
 use std::time::Duration;
 
@@ -36,7 +37,8 @@ fn wait_for(what: &str, slurm: &Slurm, folder: &Path, mut is_there: impl FnMut()
 
 #[test]
 fn jobs_of_slurm_survive_preemption_and_time_limit() {
-    let Some(slurm) = Slurm::new("jobs_of_slurm_survive_preemption_and_time_limit") else { return };
+    let test = "jobs_of_slurm_survive_preemption_and_time_limit";
+    let Some(slurm) = Slurm::new(test) else { return };
     let node = fs::read_to_string("/proc/sys/kernel/hostname").expect("a node has a name");
     let bench = Bench::new(|folder| courtyard(folder, 8, 320, 256));
     let _ = bench.reconstruct("calm", &[&SLOW[..], &["--workers", "2"]].concat()).expect_code(0);
@@ -58,7 +60,8 @@ fn jobs_of_slurm_survive_preemption_and_time_limit() {
     ];
     let coordinator = slurm.batch(folder, &["--partition=service", &sbatch("coordinator")], &variables);
     let worker = sbatch("worker");
-    let workers = ["--array=0-1", "--cpus-per-task=1", &worker, "--device", "torch"];
+    // What is given here counts before what the script gives.
+    let workers = ["--array=0-1", "--cpus-per-task=1", &worker, "--device", "torch", "--threads", "1"];
     let workers = slurm.batch(folder, &workers, &variables);
     wait_for("the coordinator's address", &slurm, folder, || folder.join("address").exists());
     let url = format!("http://127.0.0.1:{port}");
@@ -96,11 +99,18 @@ fn jobs_of_slurm_survive_preemption_and_time_limit() {
         let address = format!("maps are served at http://{}:", node.trim());
         assert!(log.contains(&address), "no '{address}' in {log}");
     }
-    let other = ["--depths", "64", "--device", "torch", "--token-file", &token];
-    let _ = bench.submit_to("other", &url, &other).wait().expect_code(0);
-    let report: Value = serde_json::from_slice(&bench.read("other/report.json")).expect("a report");
-    let ways = &report["maps_by_way"];
-    assert!(ways["by stream"].as_u64() > Some(0), "{ways}");
+    if (node.trim(), 0).to_socket_addrs().is_ok() {
+        let other = ["--depths", "64", "--device", "torch", "--token-file", &token];
+        let _ = bench.submit_to("other", &url, &other).wait().expect_code(0);
+        let report: Value = serde_json::from_slice(&bench.read("other/report.json")).expect("a report");
+        let ways = &report["maps_by_way"];
+        assert!(ways["by stream"].as_u64() > Some(0), "{ways}");
+    } else {
+        eprintln!(
+            "SKIPPED {test}, maps as streams: this host has no address under its name, {}",
+            node.trim()
+        );
+    }
 
     // The end: the coordinator takes its workers along.
     slurm.ask("scancel", &["--batch", "--signal=INT", &coordinator]);

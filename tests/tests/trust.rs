@@ -101,8 +101,13 @@ fn certificates_that_are_none_are_refused_and_maps_do_not_leave_the_host_in_plai
     let token = bench.path("token");
     std::fs::write(&token, "s3cret").expect("written");
     let open = ["worker", "--coordinator", "https://127.0.0.1:1", "--listen", "0.0.0.0:0", "--tls-ca", &ca];
-    let refused = run(open.iter().chain(&["--token-file", &token])).expect_code(1);
+    let refused = run(open.iter().chain(&["--token-file", &token])).expect_code(REFUSED);
     assert!(refused.stderr.contains("over TLS only"), "{}", refused.stderr);
+    // An address that is taken may be free elsewhere.
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let taken = listener.local_addr().expect("it is bound").to_string();
+    let refused = run(["worker", "--coordinator", "http://127.0.0.1:1", "--listen", &taken]).expect_code(1);
+    assert!(refused.stderr.contains("could not listen"), "{}", refused.stderr);
 }
 
 #[test]
@@ -112,6 +117,9 @@ fn callers_without_the_token_are_refused_and_counted() {
     let open = ["coordinator", "--listen", "0.0.0.0:0", "--ledger", &ledger, "--store", &store];
     let refused = run(open).expect_code(1);
     assert!(refused.stderr.contains("a token is needed"), "{}", refused.stderr);
+    let open = ["worker", "--coordinator", "http://127.0.0.1:1", "--listen", "0.0.0.0:0"];
+    let refused = run(open).expect_code(REFUSED);
+    assert!(refused.stderr.contains("only with a token"), "{}", refused.stderr);
 
     let (token, wrong) = (bench.path("token"), bench.path("wrong"));
     std::fs::write(&token, "s3cret\n").expect("written");

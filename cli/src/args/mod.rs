@@ -121,17 +121,17 @@ mod tests {
     }
 
     #[test]
-    fn what_a_script_lets_a_worker_listen_on_can_be_given_anew() {
-        let listens = |more: &[&str]| {
-            let script =
-                ["planesweep", "worker", "--coordinator", "http://head:7070", "--listen", "0.0.0.0:0"];
-            match Cli::try_parse_from(script.iter().chain(more)).expect("valid").command {
-                Command::Worker(args) => args.listen.to_string(),
+    fn what_a_script_gives_a_worker_can_be_given_anew() {
+        let parsed = |more: &[&str]| {
+            let script = "planesweep worker --coordinator http://head:7070 --listen 0.0.0.0:0 --threads 4";
+            match Cli::try_parse_from(script.split(' ').chain(more.iter().copied())).expect("valid").command {
+                Command::Worker(args) => (args.listen.to_string(), args.threads),
                 other => panic!("parsed as {other:?}"),
             }
         };
-        assert_eq!(listens(&[]), "0.0.0.0:0");
-        assert_eq!(listens(&["--listen", "127.0.0.1:0"]), "127.0.0.1:0");
+        assert_eq!(parsed(&[]), ("0.0.0.0:0".to_owned(), Some(4)));
+        let anew = ["--listen", "127.0.0.1:0", "--threads", "2"];
+        assert_eq!(parsed(&anew), ("127.0.0.1:0".to_owned(), Some(2)));
     }
 
     #[test]

@@ -9,7 +9,7 @@ use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
 use planesweep_plan::WorkerId;
 use planesweep_proto::{Role, Slots};
-use planesweep_worker::{ExchangeConfig, WorkerConfig, WorkerError, run_worker};
+use planesweep_worker::{ExchangeConfig, ExchangeError, WorkerConfig, WorkerError, run_worker};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
@@ -22,8 +22,11 @@ use crate::network::{Placement, backend_factory, processors};
 /// Arguments of `worker`.
 #[derive(Debug, Args)]
 #[command(
-    after_help = "Exit codes: 0 the coordinator said stop; 75 a SIGTERM did, start it again elsewhere; 78 the \
-    coordinator refuses it (token, version), do not start it again; 1 anything else.\n\
+    // Scripts give some, and whoever calls them may give them anew.
+    args_override_self = true,
+    after_help = "An option that is given twice counts as it is given last.\n\
+    Exit codes: 0 the coordinator said stop; 75 a SIGTERM did, start it again elsewhere; 78 the coordinator refuses it \
+    (token, version), or it may not serve its maps as it is told, do not start it again; 1 anything else.\n\
     Example: planesweep worker --coordinator http://10.0.0.1:7070 --role both"
 )]
 pub struct WorkerArgs {
@@ -33,9 +36,8 @@ pub struct WorkerArgs {
     #[arg(long, value_enum, default_value = "both")]
     pub role: RoleArg,
     /// Where other workers fetch the maps that this one has in memory, such as 10.0.0.2:7071; port 0 takes
-    /// a free one, and 0.0.0.0 is found by the host's name. Beyond this host a token is needed. Given twice, the last
-    /// one counts.
-    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:0", overrides_with = "listen")]
+    /// a free one, and 0.0.0.0 is found by the host's name. Beyond this host a token is needed.
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:0")]
     pub listen: SocketAddr,
     #[command(flatten)]
     pub tls: ServerTlsArgs,
@@ -94,7 +96,9 @@ pub fn exit_code(error: &anyhow::Error) -> Option<u8> {
     const TEMPFAIL: u8 = 75;
     const CONFIG: u8 = 78;
     match error.downcast_ref() {
-        Some(WorkerError::Refused { .. }) => Some(CONFIG),
+        // Elsewhere, or later, it may get what it listens on.
+        Some(WorkerError::Exchange(ExchangeError::Listen { .. })) => None,
+        Some(WorkerError::Refused { .. } | WorkerError::Exchange(_)) => Some(CONFIG),
         _ => error.is::<Terminated>().then_some(TEMPFAIL),
     }
 }
