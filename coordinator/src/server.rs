@@ -21,7 +21,7 @@ use tonic::service::interceptor::InterceptedService;
 use crate::config::{Config, ConfigError, ServedStore};
 use crate::driver::{Driver, DriverHandle, Message, Settings};
 use crate::ledger::{Ledger, LedgerError};
-use crate::service::{BlobService, Service, refusal};
+use crate::service::{BlobService, Service};
 
 /// How long calls may take to end when the server stops.
 const CLOSING: Duration = Duration::from_secs(2);
@@ -156,7 +156,8 @@ impl Handle {
 
     /// Every job of a run, in the order of the plan.
     pub async fn results(&self, run: &RunId) -> Result<Vec<JobResult>, ServiceError> {
-        self.service.ledger.results(run, 0, usize::MAX >> 1).await.map_err(|e| refusal(&e))
+        let ledger = &self.service.ledger;
+        ledger.results(run, 0, usize::MAX >> 1).await.map_err(|e| ledger.refusal(&e))
     }
 
     /// Stops a run; what is done stays.
@@ -172,10 +173,11 @@ impl Handle {
     /// Waits until every job of a run ended, or the run was cancelled. Waits for ever when no worker
     /// comes; [`Handle::status`] tells.
     pub async fn wait_finished(&self, run: &RunId) -> Result<RunStatus, ServiceError> {
+        let ledger = &self.service.ledger;
         let mut changes = self.driver().changes();
         loop {
             changes.borrow_and_update();
-            if self.service.ledger.is_finished(run).await.map_err(|e| refusal(&e))? {
+            if ledger.is_finished(run).await.map_err(|e| ledger.refusal(&e))? {
                 return self.status(run, 0).await;
             }
             if changes.changed().await.is_err() {

@@ -33,8 +33,13 @@ pub enum Code {
     Internal,
 }
 
-/// In the details of a status: the resource that is exhausted is a disk.
-const DISK_FULL: &[u8] = b"disk full";
+/// In the details of a status, and at the beginning of its message: the resource that is exhausted is a disk.
+const DISK_FULL: &str = "disk full";
+
+/// Proxies may drop the details; they leave the message.
+fn says_disk_full(status: &Status) -> bool {
+    status.details() == DISK_FULL.as_bytes() || status.message().starts_with(DISK_FULL)
+}
 
 impl Code {
     /// Whether the same call may succeed later.
@@ -75,6 +80,11 @@ impl ServiceError {
         Self { code, message: message.into() }
     }
 
+    /// The disk under the store, or under the ledger, at this place has no room left.
+    pub fn disk_full(place: impl fmt::Display, more: impl fmt::Display) -> Self {
+        Self::new(Code::DiskFull, format!("{DISK_FULL} at {place}; {more}"))
+    }
+
     /// Whether the same call may succeed later.
     pub fn is_retryable(&self) -> bool {
         self.code.is_retryable()
@@ -104,7 +114,7 @@ impl From<ServiceError> for Status {
             Code::Unavailable => tonic::Code::Unavailable,
             Code::Internal => tonic::Code::Internal,
         };
-        let details = if error.code == Code::DiskFull { DISK_FULL } else { &[] };
+        let details = if error.code == Code::DiskFull { DISK_FULL.as_bytes() } else { &[] };
         Self::with_details(code, error.message, Bytes::from_static(details))
     }
 }
@@ -118,7 +128,7 @@ impl From<Status> for ServiceError {
             tonic::Code::Unauthenticated | tonic::Code::PermissionDenied => Code::Unauthenticated,
             tonic::Code::FailedPrecondition => Code::VersionMismatch,
             tonic::Code::NotFound => Code::NotFound,
-            tonic::Code::ResourceExhausted if status.details() == DISK_FULL => Code::DiskFull,
+            tonic::Code::ResourceExhausted if says_disk_full(&status) => Code::DiskFull,
             tonic::Code::ResourceExhausted => Code::TooLarge,
             tonic::Code::Aborted => Code::Superseded,
             // Time-outs, broken connections and servers that go away come in all of these.
@@ -176,6 +186,14 @@ mod tests {
             let back = ServiceError::from(Status::from(error.clone()));
             assert_eq!((back.is_retryable(), &back), (error.is_retryable(), &error));
         }
+    }
+
+    #[test]
+    fn a_full_disk_is_known_by_its_message_where_a_proxy_drops_the_details() {
+        let told =
+            |message: String| ServiceError::from(Status::new(tonic::Code::ResourceExhausted, message)).code;
+        assert_eq!(told(ServiceError::disk_full("/ledger", "wait").message), Code::DiskFull);
+        assert_eq!(told("the message has 9 bytes, the limit is 8".to_owned()), Code::TooLarge);
     }
 
     #[test]

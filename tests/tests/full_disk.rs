@@ -88,7 +88,7 @@ fn a_full_disk_under_the_ledger_is_waited_for_until_there_is_room() {
     fill(Path::new(&folder));
     let workers = [cluster.worker(&ANALYTIC), cluster.worker(&ANALYTIC)];
     let message = format!("disk full at {ledger}");
-    // The kind, then the text: workers are told apart what is full from what is out of order.
+    // The code tells a full disk from a broken ledger.
     let refusal = format!("no room: {message}");
     let is_told = || workers.iter().all(|worker| worker.stderr().contains(&refusal));
     assert!(wait_until(DEADLINE, is_told), "{}\n{}", workers[0].stderr(), cluster.coordinator_stderr());

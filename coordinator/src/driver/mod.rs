@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 use planesweep_plan::{JobId, WorkerId};
 use planesweep_proto::{
-    Code, Order, Produced, Role, ServiceError, StorePlace, WorkerState, WorkerStatus, with_causes,
+    Order, Produced, Role, ServiceError, StorePlace, WorkerState, WorkerStatus, with_causes,
 };
 use tokio::sync::{mpsc, watch};
 use tokio::time::MissedTickBehavior;
@@ -210,19 +210,14 @@ impl Driver {
 
     /// The step failed and was rolled back: what the ledger says holds.
     async fn recover(&mut self, error: &LedgerError) -> ServiceError {
-        let (code, text) = if error.is_disk_full() {
-            // Nothing is decided until it can be written down: workers keep what they have, and report again.
-            let place = self.ledger.place();
-            (Code::DiskFull, format!("disk full at {place}; nothing goes on until there is room"))
-        } else {
-            (Code::Internal, with_causes(error))
-        };
-        tracing::error!(error = text, "the ledger failed; it is read anew");
+        // Nothing is decided until it can be written down: workers keep what they have, and report again.
+        let refusal = self.ledger.refusal(error);
+        tracing::error!(error = refusal.message, "the ledger failed; it is read anew");
         self.seen = None;
         if let Err(error) = self.catch_up().await {
             tracing::error!(error = with_causes(&error), "the ledger cannot be read");
         }
-        ServiceError::new(code, text)
+        refusal
     }
 
     fn fleet(&self) -> Fleet {

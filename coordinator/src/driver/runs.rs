@@ -66,9 +66,7 @@ impl Driver {
     pub(super) async fn cancel(&mut self, run: RunId) -> Result<(), ServiceError> {
         match self.try_cancel(&run).await {
             Ok(()) => Ok(()),
-            Err(error @ LedgerError::NoSuchRun { .. }) => {
-                Err(ServiceError::new(Code::NotFound, error.to_string()))
-            }
+            Err(error @ LedgerError::NoSuchRun { .. }) => Err(self.ledger.refusal(&error)),
             Err(error) => Err(self.recover(&error).await),
         }
     }

@@ -3,6 +3,7 @@
 use std::io;
 
 use planesweep_plan::RunId;
+use planesweep_proto::{Code, ServiceError, with_causes};
 use thiserror::Error;
 
 use super::LedgerPlace;
@@ -95,5 +96,82 @@ impl LedgerError {
     /// For `map_err` on a statement.
     pub(super) fn statement(what: &'static str) -> impl Fn(sqlx::Error) -> Self {
         move |source| Self::Statement { what, source }
+    }
+
+    /// The failure of a ledger at this place as callers learn of it.
+    pub(super) fn refusal(&self, place: &LedgerPlace) -> ServiceError {
+        match self {
+            Self::NoSuchRun { .. } => ServiceError::new(Code::NotFound, with_causes(self)),
+            full if full.is_disk_full() => {
+                ServiceError::disk_full(place, "nothing goes on until there is room")
+            }
+            _ => ServiceError::new(Code::Internal, with_causes(self)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::borrow::Cow;
+    use std::error::Error;
+    use std::fmt;
+
+    use sqlx::error::{DatabaseError, ErrorKind};
+
+    use super::*;
+
+    /// What a database says with this code.
+    #[derive(Debug)]
+    struct Said(&'static str);
+
+    impl fmt::Display for Said {
+        fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            f.write_str(self.message())
+        }
+    }
+
+    impl Error for Said {}
+
+    impl DatabaseError for Said {
+        fn message(&self) -> &'static str {
+            "said by a database"
+        }
+
+        fn code(&self) -> Option<Cow<'_, str>> {
+            Some(self.0.into())
+        }
+
+        fn as_error(&self) -> &(dyn Error + Send + Sync + 'static) {
+            self
+        }
+
+        fn as_error_mut(&mut self) -> &mut (dyn Error + Send + Sync + 'static) {
+            self
+        }
+
+        fn into_error(self: Box<Self>) -> Box<dyn Error + Send + Sync + 'static> {
+            self
+        }
+
+        fn kind(&self) -> ErrorKind {
+            ErrorKind::Other
+        }
+    }
+
+    #[test]
+    fn callers_are_told_which_disk_is_full() {
+        let place = LedgerPlace::from("/runs/ledger.sqlite");
+        let told =
+            |code| LedgerError::statement("begin a step")(sqlx::Error::from(Said(code))).refusal(&place);
+        // SQLite, PostgreSQL.
+        for code in ["13", "53100"] {
+            let full = told(code);
+            assert_eq!(full.code, Code::DiskFull);
+            assert_eq!(full.message, "disk full at /runs/ledger.sqlite; nothing goes on until there is room");
+        }
+        // Too many connections.
+        let other = told("53300");
+        assert_eq!(other.code, Code::Internal);
+        assert!(other.message.ends_with("said by a database"), "{}", other.message);
     }
 }

@@ -31,6 +31,7 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use planesweep_plan::JobId;
+use planesweep_proto::ServiceError;
 use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
 use sqlx::{AnyPool, Connection, Executor};
 use url::Url;
@@ -113,9 +114,9 @@ impl Ledger {
         Ok(Self { pool, kind, place: place.clone(), _lock: lock })
     }
 
-    /// Where it lies.
-    pub fn place(&self) -> &LedgerPlace {
-        &self.place
+    /// A failure of it as callers learn of it.
+    pub(crate) fn refusal(&self, error: &LedgerError) -> ServiceError {
+        error.refusal(&self.place)
     }
 
     /// Whether other coordinators may change it, too.

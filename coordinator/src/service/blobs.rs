@@ -146,9 +146,11 @@ async fn turn(turns: &Arc<Semaphore>) -> Result<OwnedSemaphorePermit, ServiceErr
 
 /// A failure of the store as callers learn of it.
 fn refusal(error: &StoreError) -> ServiceError {
+    if let Some(url) = error.full_disk() {
+        return ServiceError::disk_full(url, with_causes(error));
+    }
     let code = match error {
         StoreError::Refused { .. } => Code::Invalid,
-        error if error.full_disk().is_some() => Code::DiskFull,
         error if error.is_lost() => Code::NotFound,
         error if error.is_passing() => Code::Unavailable,
         _ => Code::Internal,

@@ -10,16 +10,14 @@ use std::sync::Arc;
 use planesweep_plan::NUMERICS_VERSION;
 use planesweep_proto::limits::MAX_MESSAGE_BYTES;
 use planesweep_proto::wire::coordinator_server::{Coordinator, CoordinatorServer};
-use planesweep_proto::{
-    CODE_VERSION, Code, PROTOCOL_VERSION, Refusals, ServiceError, StorePlace, wire, with_causes,
-};
+use planesweep_proto::{CODE_VERSION, Code, PROTOCOL_VERSION, Refusals, ServiceError, StorePlace, wire};
 use tokio_stream::Stream;
 use tonic::{Request, Response, Status, Streaming};
 
 pub(crate) use blobs::BlobService;
 
 use crate::driver::DriverHandle;
-use crate::ledger::{Ledger, LedgerError};
+use crate::ledger::Ledger;
 
 /// What the handlers need.
 #[derive(Clone)]
@@ -106,14 +104,4 @@ fn check_versions(caller: &str, code: &str, numerics: u32) -> Result<(), Service
         "{caller} is version {code} (numerics {numerics}), the coordinator {CODE_VERSION} (numerics {NUMERICS_VERSION})"
     );
     Err(ServiceError::new(Code::VersionMismatch, text))
-}
-
-/// A failure of the ledger as callers learn of it.
-pub(crate) fn refusal(error: &LedgerError) -> ServiceError {
-    let code = match error {
-        LedgerError::NoSuchRun { .. } => Code::NotFound,
-        error if error.is_disk_full() => Code::DiskFull,
-        _ => Code::Internal,
-    };
-    ServiceError::new(code, with_causes(error))
 }

@@ -9,7 +9,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::codegen::BoxStream;
 use tonic::{Status, Streaming};
 
-use super::{Service, check_protocol, check_versions, refusal};
+use super::{Service, check_protocol, check_versions};
 use crate::driver::Message;
 
 /// Chunks of results that wait for a slow reader; the ledger is read no faster.
@@ -26,7 +26,7 @@ impl Service {
     }
 
     pub(super) async fn answer_runs(&self) -> Result<wire::RunsReply, ServiceError> {
-        let runs = self.ledger.runs().await.map_err(|e| refusal(&e))?;
+        let runs = self.ledger.runs().await.map_err(|e| self.ledger.refusal(&e))?;
         Ok(wire::RunsReply { runs: runs.iter().map(Into::into).collect() })
     }
 
@@ -67,7 +67,7 @@ impl Service {
 
     /// What the ledger says of the run, and the driver of the workers.
     pub(crate) async fn status_of(&self, run: &RunId, after: u64) -> Result<RunStatus, ServiceError> {
-        let row = self.ledger.run(run, after).await.map_err(|e| refusal(&e))?;
+        let row = self.ledger.run(run, after).await.map_err(|e| self.ledger.refusal(&e))?;
         let fleet = self.driver.ask(Message::Fleet).await?;
         let unfinished: u64 = row
             .counts
@@ -98,7 +98,7 @@ impl Service {
     ) -> Result<BoxStream<wire::ResultsChunk>, ServiceError> {
         let run = RunId(request.run);
         let ledger = self.ledger.clone();
-        let mut page = ledger.results(&run, 0, RESULTS_CHUNK).await.map_err(|e| refusal(&e))?;
+        let mut page = ledger.results(&run, 0, RESULTS_CHUNK).await.map_err(|e| ledger.refusal(&e))?;
         let (sender, receiver) = mpsc::channel(CHUNKS_AHEAD);
         tokio::spawn(async move {
             let mut from = 0;
@@ -111,7 +111,7 @@ impl Service {
                 page = match ledger.results(&run, from, RESULTS_CHUNK).await {
                     Ok(page) => page,
                     Err(error) => {
-                        let _ = sender.send(Err(Status::from(refusal(&error)))).await;
+                        let _ = sender.send(Err(Status::from(ledger.refusal(&error)))).await;
                         return;
                     }
                 };
