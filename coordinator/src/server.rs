@@ -107,7 +107,8 @@ impl Coordinator {
 async fn tie(ledger: &Ledger, served: &ServedStore) -> Result<String, StartError> {
     let store = &served.store;
     let identity = match ledger.store().await? {
-        // One that says nothing is another one, and stays as it is: it may be here by mistake.
+        // One that says nothing, which no store has for an identity, is another one. Nothing is written into it: it may
+        // be here by mistake.
         Some(_) => store.said_identity().await?.unwrap_or_default(),
         None => store.identity(&served.new_identity).await?,
     };

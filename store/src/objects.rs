@@ -69,9 +69,13 @@ impl Objects {
         let (place, create) = (Path::from(IDENTITY), PutMode::Create.into());
         match self.objects.put_opts(&place, new.to_owned().into(), create).await {
             Ok(_) => Ok(new.to_owned()),
-            // Another coordinator was faster: its word holds.
+            // Another coordinator was faster: its word holds, if there is one.
             Err(object_store::Error::AlreadyExists { .. }) => {
-                Ok(self.said_identity().await?.unwrap_or_else(|| new.to_owned()))
+                if let Some(said) = self.said_identity().await? {
+                    return Ok(said);
+                }
+                self.say_identity(new).await?;
+                Ok(new.to_owned())
             }
             Err(error) => Err(self.cannot_open(&error)),
         }
@@ -87,7 +91,11 @@ impl Objects {
         let read = async { self.objects.get(&Path::from(IDENTITY)).await?.bytes().await };
         match read.await {
             // People write it with an editor or a shell, which end it with a line.
-            Ok(bytes) => Ok(Some(String::from_utf8_lossy(&bytes).trim().to_owned())),
+            Ok(bytes) => {
+                let said = String::from_utf8_lossy(&bytes).trim().to_owned();
+                // An empty object, as of a shell that found no disk space, says nothing.
+                Ok(Some(said).filter(|said| !said.is_empty()))
+            }
             Err(object_store::Error::NotFound { .. }) => Ok(None),
             Err(error) => Err(self.cannot_open(&error)),
         }

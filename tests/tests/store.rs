@@ -132,6 +132,8 @@ fn another_store_at_the_same_address_is_not_taken_for_it() {
     let runtime = Runtime::new().expect("a runtime");
     let said =
         |new: &str| runtime.block_on(Objects::open(&url).expect("a store").identity(new)).expect("one");
+    // Says nothing.
+    fs::write(folder.path().join("identity"), "\n").expect("written");
     assert_eq!(said("one"), "one");
     assert_eq!(said("another"), "one");
     runtime.block_on(async {
@@ -212,7 +214,10 @@ fn a_coordinator_whose_ledger_has_another_store_is_refused_and_told_what_to_do()
     let advice = format!("write {identity} into the object \"identity\" of file://{other}");
     assert!(refused.stderr.contains(&advice), "{}", refused.stderr);
     let said = format!("{other}/identity");
-    assert!(!fs::exists(&said).expect("it can be looked for"), "a store that is refused stays as it was");
+    assert!(
+        !fs::exists(&said).expect("it can be looked for"),
+        "something is written into a store that is refused"
+    );
     // As a shell writes it.
     fs::write(said, format!("{identity}\n")).expect("written");
     let _ = Cluster::start_on(&ledger, &other, Vec::new(), &[]).drain().wait().expect_code(0);

@@ -245,9 +245,12 @@ async fn a_ledger_has_one_store(place: Place) {
     assert!(matches!(error, StartError::Ledger(LedgerError::OtherStore { .. })), "{text}");
     assert!(text.contains("write one into") && text.contains("/b"), "{text}");
     let identity = folder.path().join("b/identity");
-    assert!(!identity.exists(), "a store that is refused stays as it was");
-    std::fs::write(&identity, "two").expect("written");
-    assert!(begin("b", "three").await.is_err(), "it is another one's");
+    assert!(!identity.exists(), "something is written into a store that is refused");
+    for said in ["", "two"] {
+        std::fs::write(&identity, said).expect("written");
+        assert!(begin("b", "three").await.is_err(), "'{said}' is another one's");
+        assert_eq!(std::fs::read(&identity).expect("it is there"), said.as_bytes());
+    }
     // It was moved, and coordinators without one of their own do not mind.
     std::fs::write(&identity, "one").expect("written");
     begin("b", "three").await.expect("the same store").shutdown().await;
