@@ -12,9 +12,12 @@ if [ -n "${LIBTORCH:-}" ]; then
     exit 0
 fi
 
+# A link that is made anew has all programs linked again.
+link() { [ "$here/.libtorch" -ef "$cache" ] || ln -sfn "$cache" "$here/.libtorch"; }
+
 cache="${XDG_CACHE_HOME:-$HOME/.cache}/planesweep/libtorch-2.13.0-cpu"
 if command -v python3 >/dev/null && python3 "$here/scripts/fetch_libtorch.py" --check "$cache"; then
-    ln -sfn "$cache" "$here/.libtorch"
+    link
     exit 0
 fi
 
@@ -34,4 +37,4 @@ if [ "$(uname -sm)" != "Linux x86_64" ]; then
 fi
 
 python3 "$here/scripts/fetch_libtorch.py" "$cache"
-ln -sfn "$cache" "$here/.libtorch"
+link

@@ -9,6 +9,10 @@ fn main() {
     println!("cargo:rerun-if-env-changed=LIBTORCH");
     // Without LIBTORCH the libraries are the system's own, which the loader finds by itself.
     if let Some(folder) = env::var_os("LIBTORCH").map(PathBuf::from) {
+        // A link that leads elsewhere from now on; what it led to does not change by that.
+        if folder.is_symlink() {
+            println!("cargo:rerun-if-changed={}", folder.display());
+        }
         let folder = folder.canonicalize().unwrap_or(folder);
         let libraries = folder.join("lib");
         // The folder, not the one file: where that is missing, a file would count as changed with every build, and one
