@@ -11,6 +11,8 @@ use crate::containers::{Containers, is_made};
 const FILE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docker/compose.yaml");
 /// For which images of a registry others stand in.
 const STAND_INS: [&str; 2] = ["postgres", "s3"];
+/// What their names begin with: those that a killed test leaves are the next one's.
+const STAND_IN: &str = "planesweep-standin";
 
 /// The file as it is, in a folder with the token and the settings that it asks for. What it started is removed with it,
 /// and so are the images that stand in for those of a registry.
@@ -36,7 +38,7 @@ impl<'a> Composition<'a> {
         // From here on, what is made is removed.
         let made = Self { containers, folder: tempfile::tempdir().expect("a temporary folder") };
         let mut standins = containers.script("docker_standins.sh");
-        if !runs(standins.arg(image).arg(s3_server).arg(made.standin()).output()) {
+        if !runs(standins.arg(image).arg(s3_server).arg(STAND_IN).output()) {
             return None;
         }
         let folder = made.folder.path();
@@ -50,8 +52,7 @@ impl<'a> Composition<'a> {
                  PLANESWEEP_PORT=\n"
             ),
         );
-        let images =
-            STAND_INS.map(|service| format!("  {service}: {{image: {}-{service}}}\n", made.standin()));
+        let images = STAND_INS.map(|service| format!("  {service}: {{image: {STAND_IN}-{service}}}\n"));
         // Beside the images: inference is slow, and workers are asked soon how they are.
         write(
             "standins.yaml",
@@ -86,11 +87,6 @@ impl<'a> Composition<'a> {
         self.containers.prefix()
     }
 
-    /// What the names of the images that stand in begin with: no other test has them.
-    pub fn standin(&self) -> String {
-        format!("{}-standin", self.project())
-    }
-
     /// The name of one of a service's containers; they are counted from 1.
     pub fn container(&self, service: &str, number: usize) -> String {
         format!("{}-{service}-{number}", self.project())
@@ -109,7 +105,7 @@ impl Drop for Composition<'_> {
             "1",
         ]);
         for service in STAND_INS {
-            let _ = self.containers.try_docker(&["image", "rm", &format!("{}-{service}", self.standin())]);
+            let _ = self.containers.try_docker(&["image", "rm", &format!("{STAND_IN}-{service}")]);
         }
     }
 }

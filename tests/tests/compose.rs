@@ -132,9 +132,9 @@ fn the_composition_survives_a_dead_worker_and_gives_the_cloud_of_one_process() {
     cluster.compose(&["--profile", "submit", "down", "--volumes"]);
     assert_eq!(volumes(), "");
 
-    // The images that stood in were this test's.
-    let images = format!("reference={}-*", cluster.standin());
-    let standins = || containers.docker(&["image", "ls", "--quiet", "--filter", &images]);
+    // The images that stood in go, too.
+    let images = "reference=planesweep-standin-*";
+    let standins = || containers.docker(&["image", "ls", "--quiet", "--filter", images]);
     assert_eq!(standins().lines().count(), 2, "{}", standins());
     drop(cluster);
     assert_eq!(standins(), "");
