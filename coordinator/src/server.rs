@@ -63,6 +63,9 @@ impl Coordinator {
         let expected = config.check()?;
         let tls = config.tls.as_ref().map(ServerTls::acceptor).transpose()?;
         let scheme = if tls.is_some() { "https" } else { "http" };
+        if tls.is_none() && !config.listen.ip().is_loopback() {
+            tracing::warn!("the token, and everything else, travels in plain text: there is no certificate");
+        }
         let listener = TcpListener::bind(config.listen).await;
         let listener = listener.map_err(|source| StartError::Listen { listen: config.listen, source })?;
         let local_addr =

@@ -56,6 +56,11 @@ pub(crate) async fn start_serving(
         format!("{scheme}://{local}")
     };
     tracing::info!("maps are served at {address}");
+    if config.tls.is_none() && !listen.ip().is_loopback() {
+        tracing::warn!(
+            "the maps, and the token of those who fetch them, travel in plain text: there is no certificate"
+        );
+    }
     let service = ExchangeServer::new(Service { maps, inbox, turns: Arc::new(Semaphore::new(MAX_FETCHES)) })
         .max_decoding_message_size(MAX_EXCHANGE_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_EXCHANGE_MESSAGE_BYTES);
