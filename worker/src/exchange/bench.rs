@@ -102,7 +102,8 @@ async fn shared_memory_against_streams() {
     let mut sender = Sender { orders: child.stdin.take().expect("piped"), answers };
     let address = Some(sender.answer(|word| word.starts_with("http://")));
     let peers = Peers::new(Trust::of("", Credentials::default()));
-    peers.learn(&[Peer { worker: WorkerId("sender".into()), endpoint: Endpoint { address, inbox: None } }]);
+    let peer = Peer { worker: WorkerId("sender".into()), endpoint: Endpoint { address, inbox: None } };
+    peers.learn(&[peer], Instant::now());
 
     for (width, height, size) in SIZES {
         let (mut shared, mut streamed, mut ratios) = (Vec::new(), Vec::new(), Vec::new());

@@ -203,7 +203,7 @@ async fn the_next_way_is_taken_when_one_ends() {
 
     drop(infers);
     // Its server ends on a task of its own.
-    let begun = std::time::Instant::now();
+    let begun = Instant::now();
     while came(&other).await != Way::Store {
         assert!(begun.elapsed() < Duration::from_mins(1), "what is gone still answers");
         tokio::time::sleep(Duration::from_millis(20)).await;

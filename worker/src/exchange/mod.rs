@@ -28,7 +28,7 @@ mod killed;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::{BufMut, Bytes};
 use planesweep_plan::{BlobKey, WorkerId};
@@ -147,7 +147,7 @@ impl Exchange {
 
     /// Notes what the coordinator says of other workers.
     pub fn learn(&self, peers: &[Peer]) {
-        self.peers.learn(peers);
+        self.peers.learn(peers, Instant::now());
         self.outgoing.learn(peers);
     }
 

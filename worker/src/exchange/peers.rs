@@ -2,11 +2,15 @@
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use planesweep_plan::WorkerId;
 use planesweep_proto::{Code, Credentials, Peer, PeerClient, Produced, ServiceError};
+
+/// How long a worker that cannot be reached is not asked: each try costs a job its time.
+const REST: Duration = Duration::from_mins(1);
 
 /// What is shown to other workers, and to which: all of them want the coordinator's token, and its authority vouches
 /// for them.
@@ -44,8 +48,16 @@ fn is_on_this_host(url: &str) -> bool {
 /// The workers that maps can be fetched from.
 pub(crate) struct Peers {
     trust: Trust,
-    /// By address; without a client those that are shown nothing.
-    known: Mutex<BTreeMap<WorkerId, (String, Option<PeerClient>)>>,
+    known: Mutex<BTreeMap<WorkerId, Known>>,
+}
+
+/// What is known of another worker.
+struct Known {
+    address: String,
+    /// None for one that is shown nothing, or is not asked for a while.
+    client: Option<PeerClient>,
+    /// When it could not be reached last.
+    failed: Option<Instant>,
 }
 
 impl Peers {
@@ -54,28 +66,36 @@ impl Peers {
         Self { trust, known: Mutex::new(BTreeMap::new()) }
     }
 
-    /// Notes where workers are. What is in the memory of those that are refused comes from the store.
-    pub fn learn(&self, peers: &[Peer]) {
-        let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
+    /// Notes where workers are. What is in the memory of those that are refused comes from the store, and so it does
+    /// for a while if one cannot be reached.
+    pub fn learn(&self, peers: &[Peer], now: Instant) {
+        let mut known = self.known();
         for Peer { worker, endpoint } in peers {
             let Some(address) = &endpoint.address else { continue };
-            if known.get(worker).is_some_and(|(is, _)| is == address) {
+            let before = known.get(worker).filter(|known| known.address == *address);
+            let failed = before.and_then(|known| known.failed);
+            let has_rested = failed.is_some_and(|failed| now.duration_since(failed) >= REST);
+            if before.is_some_and(|known| known.client.is_some() || !has_rested) {
                 continue;
             }
             let client = self.trust.client(address);
             let error = client.as_ref().err().cloned();
-            known.insert(worker.clone(), (address.clone(), client.ok()));
+            known.insert(worker.clone(), Known { address: address.clone(), client: client.ok(), failed });
             if let Some(error) = error {
-                let refused = known.values().filter(|(_, client)| client.is_none()).count();
+                let is_refused = |known: &&Known| known.client.is_none() && known.failed.is_none();
+                let refused = known.values().filter(is_refused).count();
                 tracing::warn!(%worker, %error, refused, "nothing is fetched from a worker at this address");
             }
         }
     }
 
-    /// A client of the worker, if it is known where it is.
+    fn known(&self) -> MutexGuard<'_, BTreeMap<WorkerId, Known>> {
+        self.known.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A client of the worker, if it is known where it is, and it is asked.
     pub fn client(&self, worker: &WorkerId) -> Option<PeerClient> {
-        let known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        known.get(worker).and_then(|(_, client)| client.clone())
+        self.known().get(worker)?.client.clone()
     }
 
     /// The bytes of a blob from the worker that made it, if it still has them.
@@ -85,17 +105,20 @@ impl Peers {
             Ok(bytes) => Some(bytes),
             Err(error) => {
                 tracing::debug!(worker = %wanted.worker, %error, "a map does not come from its worker");
-                self.give_up_on(&wanted.worker, &error);
+                self.note_failure(&wanted.worker, &error, Instant::now());
                 None
             }
         }
     }
 
-    /// A worker that cannot be reached is asked no more until the coordinator names it again: each try
-    /// costs a job its time.
-    fn give_up_on(&self, worker: &WorkerId, error: &ServiceError) {
-        if error.is_retryable() {
-            self.known.lock().unwrap_or_else(PoisonError::into_inner).remove(worker);
+    /// Lets a worker rest that cannot be reached, and says so the first time.
+    fn note_failure(&self, worker: &WorkerId, error: &ServiceError, now: Instant) {
+        let mut known = self.known();
+        let Some(known) = known.get_mut(worker).filter(|_| error.is_retryable()) else { return };
+        known.client = None;
+        if known.failed.replace(now).is_none() {
+            let (address, rest_s) = (&known.address, REST.as_secs());
+            tracing::warn!(%worker, address, %error, rest_s, "a worker cannot be reached, its maps come from the store");
         }
     }
 }
@@ -105,6 +128,32 @@ mod tests {
     use planesweep_proto::Endpoint;
 
     use super::*;
+
+    fn peer(worker: &str, address: &str) -> Peer {
+        let endpoint = Endpoint { address: Some(address.to_owned()), inbox: None };
+        Peer { worker: WorkerId(worker.to_owned()), endpoint }
+    }
+
+    #[tokio::test]
+    async fn who_cannot_be_reached_is_asked_again_after_a_while_only() {
+        let peers = Peers::new(Trust::of("http://head:7070", Credentials::default()));
+        let (worker, begun) = (WorkerId("other".to_owned()), Instant::now());
+        let named = |address: &str, after: Duration| {
+            peers.learn(&[peer("other", address)], begun + after);
+            peers.client(&worker).is_some()
+        };
+        assert!(named("http://other:7071", Duration::ZERO));
+        // It has the map no longer, but it answers.
+        peers.note_failure(&worker, &ServiceError::new(Code::NotFound, "gone"), begun);
+        assert!(named("http://other:7071", Duration::ZERO));
+
+        let unreachable = ServiceError::new(Code::Unavailable, "no route");
+        peers.note_failure(&worker, &unreachable, begun);
+        assert!(!named("http://other:7071", Duration::ZERO) && !named("http://other:7071", REST / 2));
+        assert!(named("http://other:7071", REST));
+        peers.note_failure(&worker, &unreachable, begun + REST);
+        assert!(!named("http://other:7071", REST * 3 / 2) && named("http://elsewhere:7071", REST * 3 / 2));
+    }
 
     #[tokio::test]
     async fn a_token_for_tls_leaves_the_host_over_tls_only() {
@@ -117,20 +166,16 @@ mod tests {
             ("http://[::1]:7071", true),
             ("https://other:7071", true),
         ];
-        let peer = |address: &str| Peer {
-            worker: WorkerId(address.to_owned()),
-            endpoint: Endpoint { address: Some(address.to_owned()), inbox: None },
-        };
         for coordinators in ["https://head:7070", "http://one:7070,HTTPS://two:7070"] {
             let peers = Peers::new(Trust::of(coordinators, Credentials::of_token(Some("s3cret"))));
-            peers.learn(&addresses.map(|(address, _)| peer(address)));
+            peers.learn(&addresses.map(|(address, _)| peer(address, address)), Instant::now());
             for (address, is_asked) in addresses {
                 let client = peers.client(&WorkerId(address.to_owned()));
                 assert_eq!(client.is_some(), is_asked, "{address} of {coordinators}");
             }
         }
         let peers = Peers::new(Trust::of("http://head:7070", Credentials::of_token(Some("s3cret"))));
-        peers.learn(&[peer("http://other:7071")]);
+        peers.learn(&[peer("http://other:7071", "http://other:7071")], Instant::now());
         assert!(peers.client(&WorkerId("http://other:7071".to_owned())).is_some());
     }
 }
