@@ -130,7 +130,8 @@ pub async fn follow(
         let each = if inferred > 0 { infer_seconds / f64::from(inferred) } else { 0.0 };
         progress.show(
             status.count(JobState::Done) + status.count(JobState::Failed),
-            format!("{}, {each:.1} s each", inferences_done(&status)),
+            work_done(&status),
+            &format!("{}, {each:.1} s each", inferences_done(&status)),
         );
         if status.waiting.is_some_and(|waiting| waiting > WAITING) != was_waiting {
             was_waiting = !was_waiting;
@@ -152,6 +153,16 @@ pub async fn follow(
             }
         }
     }
+}
+
+/// How much of the run is done, and how much there is, in jobs other than inference.
+fn work_done(status: &RunStatus) -> (f64, f64) {
+    // About what an inference takes, in filters and emissions of a view.
+    const INFERENCE: f64 = 40.0;
+    status.counts.iter().fold((0.0, 0.0), |(done, all), ((kind, state), jobs)| {
+        let work = *jobs as f64 * if kind == "infer" { INFERENCE } else { 1.0 };
+        (done + if has_ended(*state) { work } else { 0.0 }, all + work)
+    })
 }
 
 /// Asks until there is an answer: a coordinator may be restarted while a run goes on. `None` when

@@ -31,6 +31,9 @@ pub struct Progress {
     is_terminal: bool,
     /// Jobs done when the last plain line was printed.
     printed: u64,
+    /// Work that was done when it was first shown, by an earlier run or in a step that reads more than others; and when
+    /// that was, in seconds.
+    first: Option<(f64, f64)>,
 }
 
 impl Progress {
@@ -39,25 +42,31 @@ impl Progress {
         let is_terminal = stderr().is_terminal();
         let target = if is_terminal { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
         let bar = ProgressBar::with_draw_target(Some(total), target);
-        let style = "{bar:30} {pos}/{len} jobs  {elapsed} elapsed, {eta} left  {msg}";
+        let style = "{bar:30} {pos}/{len} jobs  {elapsed} elapsed  {msg}";
         if let Ok(style) = ProgressStyle::with_template(style) {
             bar.set_style(style);
         }
         bar.enable_steady_tick(Duration::from_millis(200));
-        Self { bar, is_terminal, printed: 0 }
+        Self { bar, is_terminal, printed: 0, first: None }
     }
 
-    /// Shows how far the run is.
-    pub fn show(&mut self, done: u64, message: String) {
+    /// Shows how far the run is: jobs done, and how much `work` is done of how much, for jobs are not alike.
+    pub fn show(&mut self, jobs: u64, work: (f64, f64), message: &str) {
         let total = self.bar.length().unwrap_or(0);
-        self.bar.set_position(done);
+        let elapsed = self.bar.elapsed().as_secs_f64();
+        let first = *self.first.get_or_insert((work.0, elapsed));
+        let left = seconds_left(first, (work.0, elapsed), work.1).map(|left| format!("{left:.0} s left"));
+        let message = Some(message).filter(|text| !text.is_empty());
+        let told: Vec<&str> = left.as_deref().into_iter().chain(message).collect();
+        let told = told.join(", ");
+        self.bar.set_position(jobs);
         let step = (total / 20).max(1);
-        if !self.is_terminal && done >= self.printed + step {
-            self.printed = done;
-            let (elapsed, left) = (self.bar.elapsed().as_secs_f64(), self.bar.eta().as_secs_f64());
-            eprintln!("{done}/{total} jobs, {elapsed:.0} s elapsed, {left:.0} s left, {message}");
+        if !self.is_terminal && jobs >= self.printed + step {
+            self.printed = jobs;
+            let comma = if told.is_empty() { "" } else { ", " };
+            eprintln!("{jobs}/{total} jobs, {elapsed:.0} s elapsed{comma}{told}");
         }
-        self.bar.set_message(message);
+        self.bar.set_message(told);
     }
 
     /// Says something that stays.
@@ -73,6 +82,12 @@ impl Progress {
     pub fn finish(&self) {
         self.bar.finish_and_clear();
     }
+}
+
+/// How long it takes on as fast as since the `first` moment, which like the one `now` is of work done and of seconds;
+/// `None` as long as nothing was done since.
+fn seconds_left(first: (f64, f64), now: (f64, f64), all: f64) -> Option<f64> {
+    (now.0 > first.0).then(|| (now.1 - first.1) * (all - now.0) / (now.0 - first.0))
 }
 
 /// Aligns the cells of rows in columns; the first row is the heading.
@@ -99,6 +114,14 @@ pub fn table(rows: &[Vec<String>]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_an_earlier_run_did_does_not_make_this_one_faster() {
+        assert_eq!(seconds_left((0.0, 0.0), (0.0, 3.0), 10.0), None);
+        assert_eq!(seconds_left((0.0, 0.0), (2.0, 3.0), 10.0), Some(12.0));
+        assert_eq!(seconds_left((6.0, 1.0), (8.0, 4.0), 10.0), Some(3.0));
+        assert_eq!(seconds_left((6.0, 1.0), (10.0, 4.0), 10.0), Some(0.0));
+    }
 
     #[test]
     fn columns_line_up() {

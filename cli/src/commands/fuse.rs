@@ -122,10 +122,11 @@ pub fn run(args: &FuseArgs, json: bool) -> Result<Outcome> {
         let files = &maps.files[&view];
         Ok(if args.filter.full_resolution { files.read_upsampled()? } else { files.read()? })
     };
-    let mut progress = Progress::new(2 * work.views.len() as u64);
+    let steps = 2 * work.views.len();
+    let mut progress = Progress::new(steps as u64);
     let mut show = |done: usize| {
         if !json {
-            progress.show(done as u64, String::new());
+            progress.show(done as u64, (done as f64, steps as f64), "");
         }
     };
     let fused = fuse_out_of_core(&work, &load, &mut show, &mut |points| {
