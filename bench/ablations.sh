@@ -54,6 +54,7 @@ print("| %s | %s | %s | %.2f %% | %.1f %% | %.1f %% | %.0f %% |" % (
 }
 
 for seed in 1 2; do
+    rm -rf "$out/courtyard-$seed"
     "$program" synth "$out/courtyard-$seed" --seed "$seed" >&2
 done
 if [ "$table" = paper ]; then

@@ -11,6 +11,8 @@ if [ -n "$weights" ] && [ "${weights%.safetensors}" = "$weights" ]; then
     weights=demo/weights.safetensors
 fi
 if [ ! -e demo/scene/sparse ]; then
+    # What an interrupted run left of it.
+    rm -rf demo/scene
     "$program" synth demo/scene
 fi
 "$program" reconstruct demo/scene -o demo/out ${weights:+--weights "$weights"}

@@ -1,5 +1,6 @@
 //! What a command leaves on the terminal.
 
+use std::fmt;
 use std::io::{IsTerminal, stderr};
 use std::time::Duration;
 
@@ -16,6 +17,18 @@ pub struct Outcome {
     /// Whether views were left out, which makes the exit code 3.
     pub skipped_views: bool,
 }
+
+/// What was asked for makes no sense, or would destroy something; the exit code is 2, as for an unknown option.
+#[derive(Debug)]
+pub struct UsageError(pub String);
+
+impl fmt::Display for UsageError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for UsageError {}
 
 /// Sends logs to stderr: warnings, with `-v` more; `PLANESWEEP_LOG` overrides both.
 pub fn start_logging(verbose: u8) {
@@ -90,6 +103,11 @@ fn seconds_left(first: (f64, f64), now: (f64, f64), all: f64) -> Option<f64> {
     (now.0 > first.0).then(|| (now.1 - first.1) * (all - now.0) / (now.0 - first.0))
 }
 
+/// How many of something there are: "1 worker", "2 workers".
+pub fn counted(count: u32, what: &str) -> String {
+    format!("{count} {what}{}", if count == 1 { "" } else { "s" })
+}
+
 /// Aligns the cells of rows in columns; the first row is the heading.
 pub fn table(rows: &[Vec<String>]) -> String {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
@@ -121,6 +139,11 @@ mod tests {
         assert_eq!(seconds_left((0.0, 0.0), (2.0, 3.0), 10.0), Some(12.0));
         assert_eq!(seconds_left((6.0, 1.0), (8.0, 4.0), 10.0), Some(3.0));
         assert_eq!(seconds_left((6.0, 1.0), (10.0, 4.0), 10.0), Some(0.0));
+    }
+
+    #[test]
+    fn one_is_no_plural() {
+        assert_eq!([counted(1, "worker"), counted(2, "worker")], ["1 worker", "2 workers"]);
     }
 
     #[test]

@@ -27,7 +27,7 @@ use std::process::ExitCode;
 use clap::Parser;
 
 use crate::args::{Cli, Command};
-use crate::console::Outcome;
+use crate::console::{Outcome, UsageError};
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
@@ -64,6 +64,9 @@ fn main() -> ExitCode {
                 let _ = writeln!(stdout(), "{}", serde_json::json!({ "error": format!("{error:#}") }));
             }
             eprintln!("planesweep: {error:#}");
+            if error.is::<UsageError>() {
+                return ExitCode::from(2);
+            }
             commands::worker::exit_code(&error).map_or(ExitCode::FAILURE, ExitCode::from)
         }
     }

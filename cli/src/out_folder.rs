@@ -25,6 +25,8 @@ use planesweep_scene::{
     Camera, DepthHypotheses, DepthMap, DepthRange, Raster, Sampling, ViewId, write_atomically, write_pfm,
 };
 
+use crate::console::UsageError;
+
 /// All that a run writes, the cloud first and the record last: while anything is left of an earlier
 /// run, its record says so.
 const WRITTEN: [&str; 11] = [
@@ -133,23 +135,54 @@ impl OutFolder {
 
     fn path(&self, name: &str) -> Result<PathBuf> {
         let path = self.root.join(name);
-        let folder = path.parent().unwrap_or(&self.root);
-        fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+        make_folder_of(&path)?;
         Ok(path)
     }
 }
 
 /// Refuses an output folder that would be written over the scene or cannot be named on the wire.
 pub fn check_out(out: &Path, scene: &Path) -> Result<()> {
-    fs::create_dir_all(out).with_context(|| format!("cannot make the folder {}", out.display()))?;
-    let out = out.canonicalize().with_context(|| format!("cannot find {}", out.display()))?;
-    if scene.canonicalize().is_ok_and(|scene| scene == out) {
-        bail!("the result would be written over the scene; choose another folder for -o");
+    if is_scene(out, scene) {
+        bail!(UsageError(
+            "the result would be written over the scene; choose another folder for -o".to_owned()
+        ));
     }
-    if out.to_str().is_none() {
-        bail!("the path of {} is not UTF-8; choose another folder for -o", out.display());
+    let absolute = std::path::absolute(out).with_context(|| format!("cannot find {}", out.display()))?;
+    if absolute.to_str().is_none() {
+        bail!(UsageError(format!(
+            "the path of {} is not UTF-8; choose another folder for -o",
+            out.display()
+        )));
     }
     Ok(())
+}
+
+/// Whether a folder is that of a scene, which is named by its folder or by a file in there.
+pub fn is_scene(folder: &Path, scene: &Path) -> bool {
+    let (Ok(folder), Ok(scene)) = (folder.canonicalize(), scene.canonicalize()) else { return false };
+    scene == folder || (scene.is_file() && scene.parent() == Some(&folder))
+}
+
+/// Refuses a folder that holds anything: what is written would mix with it, or replace it.
+pub fn check_empty(folder: &Path) -> Result<()> {
+    let is_used = match fs::read_dir(folder) {
+        Ok(mut entries) => entries.next().is_some(),
+        Err(error) if error.kind() == ErrorKind::NotFound => false,
+        Err(error) => return Err(error).with_context(|| format!("cannot list {}", folder.display())),
+    };
+    if is_used {
+        bail!(UsageError(format!(
+            "{} is not empty; name a new folder, or remove this one first",
+            folder.display()
+        )));
+    }
+    Ok(())
+}
+
+/// Makes the folder that a file goes to.
+pub fn make_folder_of(file: &Path) -> Result<()> {
+    let folder = file.parent().unwrap_or(file);
+    fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))
 }
 
 fn stem(name: &str) -> String {
@@ -195,5 +228,29 @@ mod tests {
         assert_eq!(names(&[(1, "a/IMG.1.JPG"), (2, "a/IMG.2.JPG")]), ["a/IMG.1", "a/IMG.2"]);
         assert_eq!(names(&[(1, "x.jpg"), (2, "x.png")]), ["x.jpg", "x.png"]);
         assert_eq!(names(&[(1, "v1.2/plain"), (2, ".hidden")]), ["v1.2/plain", ".hidden"]);
+    }
+
+    #[test]
+    fn a_result_goes_neither_over_a_scene_nor_into_a_used_folder() {
+        let root = tempfile::tempdir().expect("a folder");
+        let scene = root.path().join("scene");
+        assert!(check_out(&scene, &scene).is_ok(), "neither is there");
+        assert!(check_empty(&scene).is_ok());
+        fs::create_dir(&scene).expect("made");
+        assert!(check_empty(&scene).is_ok());
+        let file = scene.join("transforms.json");
+        fs::write(&file, "{}").expect("written");
+        assert!(check_empty(&file).is_err(), "it is no folder");
+        let used = check_empty(&scene).expect_err("it holds a file");
+        assert!(used.is::<UsageError>() && used.to_string().contains("scene is not empty"), "{used}");
+        for named in [&scene, &file] {
+            let refused = check_out(&scene.join("../scene"), named).expect_err("it is the scene");
+            assert!(
+                refused.is::<UsageError>() && refused.to_string().contains("over the scene"),
+                "{refused}"
+            );
+        }
+        let out = scene.join("out");
+        assert!(check_out(&out, &scene).is_ok() && !out.exists());
     }
 }

@@ -6,13 +6,14 @@
 //! stereo/depth_maps/NAME.geometric.bin   depth, checked against the other views
 //! stereo/normal_maps/NAME.geometric.bin  normals in the frame of the camera
 //! stereo/fusion.cfg patch-match.cfg      the views
+//! .planesweep-workspace                  that all this is written here, and may be written again
 //! ```
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use image::RgbImage;
 use nalgebra::{Point2, Vector3};
 use planesweep_fusion::{FilteredMap, normals};
@@ -21,6 +22,13 @@ use planesweep_scene::{
     write_colmap_array, write_colmap_workspace,
 };
 
+use crate::console::UsageError;
+use crate::out_folder::{is_scene, make_folder_of};
+
+/// What is in a workspace; also in a scene, and in a workspace of COLMAP's own.
+const FOLDERS: [&str; 3] = ["images", "sparse", "stereo"];
+/// Tells a workspace that `fuse` wrote.
+const MARK: &str = ".planesweep-workspace";
 /// Rows and columns of a map between the pixels that become points of the sparse model.
 const STEP: usize = 8;
 
@@ -31,9 +39,34 @@ pub struct Workspace {
 }
 
 impl Workspace {
-    /// Begins one in a folder.
-    pub fn create(root: PathBuf) -> Result<Self> {
-        fs::create_dir_all(&root).with_context(|| format!("cannot make the folder {}", root.display()))?;
+    /// Begins one in a folder, which may hold an earlier one but no photograph, camera or map of anybody else:
+    /// `maps` is where the depth maps come from, `photographs` are theirs.
+    pub fn create<'a>(
+        root: PathBuf,
+        maps: &Path,
+        mut photographs: impl Iterator<Item = &'a Path>,
+    ) -> Result<Self> {
+        let within = |photograph: &Path| {
+            photograph
+                .canonicalize()
+                .is_ok_and(|path| root.canonicalize().is_ok_and(|root| path.starts_with(root)))
+        };
+        if is_scene(&root, maps) || photographs.any(within) {
+            bail!(UsageError(format!(
+                "the workspace would be written over the scene in {}; choose another folder for --workspace",
+                root.display()
+            )));
+        }
+        let mark = root.join(MARK);
+        if let (false, Some(used)) = (mark.exists(), FOLDERS.iter().find(|name| root.join(name).exists())) {
+            bail!(UsageError(format!(
+                "{} holds {used}/, which `fuse` did not write; choose another folder for --workspace",
+                root.display()
+            )));
+        }
+        make_folder_of(&mark)?;
+        fs::write(&mark, "planesweep fuse --workspace writes images/, sparse/ and stereo/ here\n")
+            .with_context(|| format!("cannot write {}", mark.display()))?;
         Ok(Self { root, scene: Scene::default() })
     }
 
@@ -88,10 +121,7 @@ impl Workspace {
         let pixels = photograph.pixels.cropped(step * width, step * height);
         let (columns, rows) = (pixels.width() as u32, pixels.height() as u32);
         let path = self.root.join("images").join(name);
-        if let Some(folder) = path.parent() {
-            fs::create_dir_all(folder)
-                .with_context(|| format!("cannot make the folder {}", folder.display()))?;
-        }
+        make_folder_of(&path)?;
         let bytes = pixels.into_values().into_flattened();
         RgbImage::from_raw(columns, rows, bytes)
             .context("an image has the bytes of its size")?

@@ -67,10 +67,13 @@ fn generated_scenes(out: &Path) -> Vec<(String, PathBuf)> {
     let mut scenes = Vec::new();
     for seed in COURTYARDS {
         let folder = out.join(format!("scenes/courtyard_{seed}"));
+        // That of an earlier run, which may have been interrupted.
+        let _ = std::fs::remove_dir_all(&folder);
         let _ = run(["synth", text(&folder), "--seed", &seed.to_string()]).expect_code(0);
         scenes.push((format!("courtyard_{seed}"), folder));
     }
     let samples = out.join("scenes/samples");
+    let _ = std::fs::remove_dir_all(&samples);
     let (first, count) = SAMPLES;
     let (seed, count_text) = (first.to_string(), count.to_string());
     let shape = ["--views", "5", "--width", "640", "--height", "480"];

@@ -173,3 +173,42 @@ fn two_views_are_enough() {
     let sources = record["views"].as_array().expect("a list").iter().map(|view| view["sources"].clone());
     assert_eq!(sources.collect::<Vec<_>>(), [serde_json::json!([1]), serde_json::json!([0])]);
 }
+
+#[test]
+fn what_makes_a_scene_never_writes_into_one() {
+    let bench = of_plane(3);
+    let (scene, mesh, samples) = (bench.scene(), bench.path("mesh.obj"), bench.path("samples"));
+    let refused = |command: &[&str], folder: &str| {
+        let refused = run(command).expect_code(2);
+        assert!(refused.stderr.contains(&format!("{folder} is not empty")), "{}", refused.stderr);
+    };
+    let files =
+        || ["images/00000000.png", "cams/00000000_cam.txt"].map(|name| bench.read(&format!("scene/{name}")));
+    let before = files();
+    refused(&["convert", &scene, &scene, "--to", "mvsnet"], &scene);
+    refused(&["synth", &scene], &scene);
+    refused(&["render-depth", &mesh, &scene, &scene], &scene);
+    assert!(files() == before && !Path::new(&bench.path("scene/sparse")).exists());
+    // Samples of other seeds may join.
+    let sample = |seed: &'static str| {
+        [
+            "synth",
+            &samples,
+            "--training",
+            "2",
+            "--views",
+            "2",
+            "--width",
+            "32",
+            "--height",
+            "32",
+            "--seed",
+            seed,
+        ]
+    };
+    for seed in ["1", "3"] {
+        let _ = run(sample(seed)).expect_code(0);
+    }
+    refused(&sample("4"), &format!("{samples}/00000004"));
+    assert!(!Path::new(&format!("{samples}/00000005")).exists());
+}

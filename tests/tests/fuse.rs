@@ -6,6 +6,40 @@ use std::path::Path;
 use planesweep_tests::{Bench, courtyard, run};
 
 #[test]
+fn a_workspace_is_made_anew_but_never_goes_over_a_scene() {
+    let bench = Bench::new(|folder| courtyard(folder, 4, 160, 128));
+    let _ = bench.reconstruct("out", &[]).expect_code(0);
+    let (scene, out) = (bench.scene(), bench.path("out"));
+    let fuse = |maps: &str, cloud: &str, workspace: &str| {
+        let options = ["--min-confidence", "0", "--min-views", "1"];
+        run(["fuse", maps, "-o", cloud, "--workspace", workspace].iter().chain(&options))
+    };
+    let photograph = bench.read("scene/images/00000000.png");
+    // The scene itself, a copy of it, and a dense workspace of COLMAP.
+    let [copy, dense, cloud] = ["copy", "dense", "clouds/cloud.ply"].map(|name| bench.path(name));
+    let _ = run(["convert", &scene, &copy, "--to", "colmap"]).expect_code(0);
+    let _ = run(["convert", &scene, &dense, "--to", "colmap", "--undistort"]).expect_code(0);
+    for used in [&scene, &copy, &dense, &out] {
+        let refused = fuse(&out, &cloud, used).expect_code(2);
+        assert!(refused.stderr.contains("for --workspace"), "{}", refused.stderr);
+    }
+    assert!(!Path::new(&cloud).exists());
+    // The folder that both go to is made, and the same command again is welcome.
+    let (workspace, inside) = (bench.path("made/workspace"), bench.path("made/workspace/fused.ply"));
+    for _ in 0..2 {
+        let _ = fuse(&out, &inside, &workspace).expect_code(0);
+    }
+    // A workspace that became a scene is no place for what is made of it.
+    let reconstruct =
+        ["reconstruct", &workspace, "-o", &bench.path("of-workspace"), "--weights", &bench.weights()];
+    let easy = ["--min-confidence", "0", "--min-views", "1", "--views", "3", "--depths", "32"];
+    let _ = run(reconstruct.iter().chain(&easy)).expect_code(0);
+    let refused = fuse(&bench.path("of-workspace"), &cloud, &workspace).expect_code(2);
+    assert!(refused.stderr.contains("over the scene"), "{}", refused.stderr);
+    assert!(bench.read("scene/images/00000000.png") == photograph);
+}
+
+#[test]
 fn a_result_is_fused_again_to_the_same_bytes() {
     let bench = Bench::new(|folder| courtyard(folder, 4, 160, 128));
     let _ = bench.reconstruct("out", &[]).expect_code(0);

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
 use planesweep_plan::{PlanOptions, plan, rank_sources};
 use planesweep_scene::{DepthRange, Scene, TargetFormat, read_scene, write_scene};
@@ -10,6 +10,7 @@ use serde_json::json;
 
 use crate::args::ReadArgs;
 use crate::console::Outcome;
+use crate::out_folder::check_empty;
 
 /// Source views that a pair.txt lists for each view.
 const LISTED_SOURCES: usize = 10;
@@ -20,7 +21,7 @@ const LISTED_SOURCES: usize = 10;
 pub struct ConvertArgs {
     /// The scene.
     pub scene: PathBuf,
-    /// The folder that the converted scene goes to, with its images.
+    /// The folder that the converted scene goes to, with its images; a new or empty one.
     pub out: PathBuf,
     /// The format to write.
     #[arg(long, value_enum)]
@@ -47,11 +48,10 @@ pub enum TargetArg {
 
 /// Writes a scene in another format and says what that cannot hold.
 pub fn run(args: &ConvertArgs) -> Result<Outcome> {
+    // Of two scenes in one folder the wrong one may be read, and views that only one has would stay.
+    check_empty(&args.out)?;
     let mut scene = read_scene(&args.scene, &args.read.options())
         .with_context(|| format!("cannot read the scene {}", args.scene.display()))?;
-    if args.out.canonicalize().is_ok_and(|out| args.scene.canonicalize().is_ok_and(|scene| scene == out)) {
-        bail!("cannot convert {} into itself: name another folder", args.scene.display());
-    }
     let format = match args.to {
         TargetArg::Colmap => TargetFormat::Colmap,
         TargetArg::ColmapText => TargetFormat::ColmapText,
@@ -73,7 +73,7 @@ pub fn run(args: &ConvertArgs) -> Result<Outcome> {
         text.push_str(&format!("left out: view {view}: {reason}\n"));
     }
     for note in &notes {
-        text.push_str(&format!("{note}\n"));
+        text.push_str(&format!("added: {note}\n"));
     }
     for loss in &held.losses {
         text.push_str(&format!("not held: {loss}\n"));
@@ -106,13 +106,13 @@ fn complete(scene: &mut Scene) -> Vec<String> {
         }
     }
     if added > 0 {
-        notes.push(format!("added: depth ranges of {added} views, as planned for reconstruction"));
+        notes.push(format!("depth ranges of {added} views, as planned for reconstruction"));
     }
     if scene.pairs.is_empty() {
         let ranges = scene.views.values().filter_map(|view| Some((view.id, view.depth_range?))).collect();
         scene.pairs = rank_sources(scene, &scene.undistorted_cameras(), &ranges);
         scene.pairs.values_mut().for_each(|sources| sources.truncate(LISTED_SOURCES));
-        notes.push(format!("added: up to {LISTED_SOURCES} source views of each view"));
+        notes.push(format!("up to {LISTED_SOURCES} source views of each view"));
     }
     notes
 }

@@ -20,6 +20,7 @@ use crate::args::values::bytes;
 use crate::args::{FilterArgs, ReadArgs};
 use crate::console::{Outcome, Progress};
 use crate::depth_maps::{self, DepthMaps, Neighbourhood};
+use crate::out_folder::make_folder_of;
 use crate::workspace::Workspace;
 
 /// Arguments of `fuse`.
@@ -111,13 +112,16 @@ pub fn run(args: &FuseArgs, json: bool) -> Result<Outcome> {
     if args.filter.full_resolution {
         options.network_pixel *= upsampling(&maps);
     }
+    let photographs = maps.files.values().map(|files| files.view.image.as_path());
+    let workspace = args.workspace.clone().map(|root| Workspace::create(root, &args.folder, photographs));
+    let mut workspace = workspace.transpose()?;
     let work = work(args, &maps, options);
     if args.fresh && work.scratch.exists() {
         fs::remove_dir_all(&work.scratch)
             .with_context(|| format!("cannot remove {}", work.scratch.display()))?;
     }
+    make_folder_of(&args.out)?;
     let mut outputs = Outputs::create(args, format, &maps)?;
-    let mut workspace = args.workspace.clone().map(Workspace::create).transpose()?;
     let load = |view: ViewId| -> Result<DepthMap, Box<dyn std::error::Error + Send + Sync>> {
         let files = &maps.files[&view];
         Ok(if args.filter.full_resolution { files.read_upsampled()? } else { files.read()? })

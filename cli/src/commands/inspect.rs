@@ -11,7 +11,7 @@ use serde_json::json;
 
 use crate::args::values::bytes;
 use crate::args::{FilterArgs, PlanArgs, ReadArgs};
-use crate::console::{Outcome, table};
+use crate::console::{Outcome, counted, table};
 use crate::forecast::{Forecast, Team, ViewForecast};
 use crate::input::{self, all_skipped};
 use crate::network::{default_workers, processors, read_weights};
@@ -73,10 +73,10 @@ pub fn run(args: &InspectArgs) -> Result<Outcome> {
     text.push('\n');
     text.push_str(&table(&rows(scene, &plan, &forecast)));
     text.push_str(&format!(
-        "\non the processors of this machine: {:.0} s for the depth maps with {} workers of {} threads, {} MiB each\n",
+        "\non the processors of this machine: {:.0} s for the depth maps with {} of {}, {} MiB each\n",
         forecast.seconds,
-        team.workers,
-        team.threads,
+        counted(team.workers, "worker"),
+        counted(team.threads as u32, "thread"),
         forecast.worker_bytes >> 20,
     ));
     let value = json!({

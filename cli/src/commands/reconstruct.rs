@@ -14,7 +14,7 @@ use planesweep_store::Store;
 use super::export::{self, Finished};
 use crate::args::{FilterArgs, NetworkArgs, PlanArgs, ReadArgs};
 use crate::computation::Computation;
-use crate::console::Outcome;
+use crate::console::{Outcome, counted};
 use crate::interrupts::Interrupts;
 use crate::network::{Placement, backend_factory, default_workers, processors};
 use crate::out_folder::check_out;
@@ -95,9 +95,10 @@ pub fn run(args: &ReconstructArgs, json: bool, verbose: u8) -> Result<Outcome> {
     };
     if !json {
         eprintln!(
-            "{} views to infer, {} left out, {workers} workers",
+            "{} views to infer, {} left out, {}",
             prepared.plan.views.len(),
-            prepared.left_out()
+            prepared.left_out(),
+            counted(workers, "worker")
         );
     }
 

@@ -12,6 +12,7 @@ use serde_json::json;
 
 use crate::args::ReadArgs;
 use crate::console::Outcome;
+use crate::out_folder::check_empty;
 
 /// Arguments of `render-depth`.
 #[derive(Debug, Args)]
@@ -21,7 +22,7 @@ pub struct RenderDepthArgs {
     pub mesh: PathBuf,
     /// The scene whose cameras see it, in any format that `reconstruct` reads.
     pub cameras: PathBuf,
-    /// The MVSNet folder to write: images, cams, pair.txt and rendered_depth_maps.
+    /// The MVSNet folder to write, a new or empty one: images, cams, pair.txt and rendered_depth_maps.
     pub out: PathBuf,
     /// Source views per reference view at most; a pixel that none of them sees is dropped.
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=100))]
@@ -39,6 +40,7 @@ pub struct RenderDepthArgs {
 
 /// Renders depth maps of a mesh.
 pub fn run(args: &RenderDepthArgs) -> Result<Outcome> {
+    check_empty(&args.out)?;
     let mut scene = read_scene(&args.cameras, &args.read.options())
         .with_context(|| format!("cannot read the scene {}", args.cameras.display()))?;
     let mesh = read_mesh(&args.mesh)?;

@@ -1,9 +1,10 @@
 //! `planesweep submit`: a scene for a coordinator elsewhere.
 
+use std::fs;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use clap::Args;
 use planesweep_store::Store;
 use serde_json::json;
@@ -11,7 +12,7 @@ use serde_json::json;
 use super::export::{self, Finished};
 use crate::args::{ConnectArgs, FilterArgs, PlanArgs, ReadArgs};
 use crate::computation::Computation;
-use crate::console::Outcome;
+use crate::console::{Outcome, UsageError};
 use crate::interrupts::Interrupts;
 use crate::out_folder::check_out;
 use crate::prepare::{Network, Prepared, Stages};
@@ -28,7 +29,7 @@ pub struct SubmitArgs {
     /// The scene.
     pub scene: PathBuf,
     /// Wait for the end, then write the result here.
-    #[arg(short, long, required_unless_present = "detach")]
+    #[arg(short, long)]
     pub out: Option<PathBuf>,
     /// Print the run's id and wait for nothing.
     #[arg(long, conflicts_with = "out")]
@@ -60,6 +61,13 @@ pub struct SubmitArgs {
 /// Submits a scene; waits and fetches the result unless told not to.
 pub fn run(args: &SubmitArgs, json: bool) -> Result<Outcome> {
     let begun = Instant::now();
+    match &args.out {
+        Some(out) => check_out(out, &args.scene)?,
+        None if args.detach => {}
+        None => {
+            bail!(UsageError("either -o OUT is needed or --detach, which waits for no result".to_owned()))
+        }
+    }
     let mut stages = Stages::new();
     let runtime = tokio::runtime::Runtime::new().context("cannot start the runtime")?;
     let interrupts = Interrupts::default();
@@ -71,9 +79,6 @@ pub fn run(args: &SubmitArgs, json: bool) -> Result<Outcome> {
         let store = Store::of(&client, &place).await?.patient(interrupts.drain.clone());
         Ok::<_, anyhow::Error>((client, store))
     })?;
-    if let Some(out) = &args.out {
-        check_out(out, &args.scene)?;
-    }
     let network = Network::read(args.weights.as_deref(), &args.device)?;
     let options = args.plan.options(Some(&args.filter));
     let prepared = Prepared::new(
@@ -84,6 +89,10 @@ pub fn run(args: &SubmitArgs, json: bool) -> Result<Outcome> {
         args.masks.as_deref(),
         &mut stages,
     )?;
+    if let Some(out) = &args.out {
+        // Not at the end of a long run is it told that this cannot be.
+        fs::create_dir_all(out).with_context(|| format!("cannot make the folder {}", out.display()))?;
+    }
     if !json {
         eprintln!("{} views to infer, {} left out", prepared.plan.views.len(), prepared.left_out());
     }

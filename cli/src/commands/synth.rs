@@ -10,6 +10,7 @@ use planesweep_synth::{
 use serde_json::json;
 
 use crate::console::Outcome;
+use crate::out_folder::check_empty;
 
 /// Arguments of `synth`.
 #[derive(Debug, Args)]
@@ -18,7 +19,8 @@ use crate::console::Outcome;
                   planesweep synth samples --training 100 --seed 7"
 )]
 pub struct SynthArgs {
-    /// The folder that the scene goes to: a COLMAP project with exact depth in depth_gt/.
+    /// The folder that the scene goes to: a COLMAP project with exact depth in depth_gt/. A new or empty one; beside
+    /// training samples there may be others.
     pub out: PathBuf,
     /// Another seed makes another scene.
     #[arg(long, default_value_t = 1)]
@@ -51,6 +53,7 @@ pub fn run(args: &SynthArgs) -> Result<Outcome> {
 }
 
 fn write_scene(args: &SynthArgs) -> Result<Outcome> {
+    check_empty(&args.out)?;
     let style = Style::default();
     let style = Style {
         views: args.views.map_or(style.views, |views| views as usize),
@@ -85,8 +88,10 @@ fn write_samples(args: &SynthArgs, count: u32) -> Result<Outcome> {
     for folder in &args.library {
         library.add_folder(folder)?;
     }
-    for seed in (args.seed..).take(count as usize) {
-        let folder = args.out.join(format!("{seed:08}"));
+    let samples: Vec<(u64, PathBuf)> =
+        (args.seed..).take(count as usize).map(|seed| (seed, args.out.join(format!("{seed:08}")))).collect();
+    samples.iter().try_for_each(|(_, folder)| check_empty(folder))?;
+    for (seed, folder) in samples {
         write_training_sample(&folder, &training_sample_with(seed, &options, &library))
             .with_context(|| format!("cannot write the training sample {}", folder.display()))?;
     }
