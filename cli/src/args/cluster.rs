@@ -6,6 +6,8 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use planesweep_proto::{Client, Credentials, ServerTls};
 
+use super::values::coordinator;
+
 /// Where the token comes from when no file is named.
 const TOKEN_VARIABLE: &str = "PLANESWEEP_TOKEN";
 
@@ -87,7 +89,7 @@ fn read_pem(path: &Path) -> Result<Vec<u8>> {
 pub struct ConnectArgs {
     /// The coordinator's address, such as http://10.0.0.1:7070 or https://head:7070; with commas between, several
     /// that share a ledger, of which the next is called when one cannot be reached.
-    #[arg(long, env = "PLANESWEEP_COORDINATOR", value_name = "URL")]
+    #[arg(long, env = "PLANESWEEP_COORDINATOR", value_name = "URL", value_parser = coordinator)]
     pub coordinator: String,
     #[command(flatten)]
     pub credentials: CredentialArgs,

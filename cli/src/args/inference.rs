@@ -6,7 +6,7 @@ use clap::{Args, ValueEnum};
 use planesweep_plan::{PlanOptions, SamplingChoice};
 
 use super::FilterArgs;
-use super::values::{bytes, depth_range};
+use super::values::{bytes, depth_range, device};
 
 /// A set of choices under one name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -102,7 +102,7 @@ pub struct NetworkArgs {
     #[arg(long, env = "PLANESWEEP_WEIGHTS", value_name = "FILE")]
     pub weights: Option<PathBuf>,
     /// Where to infer: cpu, torch (the plain network of libtorch on the processor), cuda or cuda:N.
-    #[arg(long, default_value = "cpu")]
+    #[arg(long, default_value = "cpu", value_parser = device)]
     pub device: String,
     /// Memory for inference, such as 800M or 2G, shared by all workers; less than the least that is
     /// possible is taken for that. Changes no bit of the result.

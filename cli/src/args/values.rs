@@ -56,6 +56,30 @@ pub fn seconds(text: &str) -> Result<Duration, String> {
     if duration.is_zero() { Err(format!("{text} is not positive")) } else { Ok(duration) }
 }
 
+/// Where to infer; whether it is there shows when it is used.
+pub fn device(text: &str) -> Result<String, String> {
+    let is_numbered = text.strip_prefix("cuda:").is_some_and(|number| number.parse::<u32>().is_ok());
+    // The last one is the test double.
+    if is_numbered || ["cpu", "torch", "cuda", "analytic"].contains(&text) {
+        Ok(text.to_owned())
+    } else {
+        Err("it is none of cpu, torch, cuda and cuda:N".to_owned())
+    }
+}
+
+/// Addresses of a coordinator, with commas between.
+pub fn coordinator(text: &str) -> Result<String, String> {
+    let is_address = |address: &str| {
+        let host = address.trim().strip_prefix("http://").or_else(|| address.trim().strip_prefix("https://"));
+        host.is_some_and(|host| !host.is_empty() && !host.starts_with([':', '/']))
+    };
+    if text.split(',').all(is_address) {
+        Ok(text.to_owned())
+    } else {
+        Err("an address is like http://10.0.0.1:7070 or https://head:7070".to_owned())
+    }
+}
+
 /// A pixel, column and row, as "X,Y".
 pub fn pixel(text: &str) -> Result<(usize, usize), String> {
     let number = |text: &str| text.trim().parse().ok();
@@ -72,6 +96,22 @@ mod tests {
         assert_eq!(bytes("1.5G"), Ok(3 << 29));
         assert_eq!(bytes("800MiB"), Ok(800 << 20));
         assert!(bytes("2X").is_err() && bytes("-1G").is_err());
+    }
+
+    #[test]
+    fn devices_and_coordinators_have_a_form() {
+        for right in ["cpu", "torch", "cuda", "cuda:1"] {
+            assert_eq!(device(right).as_deref(), Ok(right));
+        }
+        for wrong in ["gpu", "cuda:", "cuda:x", ""] {
+            assert!(device(wrong).is_err(), "{wrong}");
+        }
+        for right in ["http://head:7070", "https://a:1,https://b:2"] {
+            assert_eq!(coordinator(right).as_deref(), Ok(right));
+        }
+        for wrong in ["foo", "head:7070", "http://", "http://:7070", "http://a:1,b"] {
+            assert!(coordinator(wrong).is_err(), "{wrong}");
+        }
     }
 
     #[test]

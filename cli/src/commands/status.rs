@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use clap::Args;
 use planesweep_plan::RunId;
 use planesweep_proto::{Client, JobState, RunStatus, RunSummary};
@@ -16,7 +16,7 @@ use crate::console::{Outcome, table};
 /// Arguments of `status`.
 #[derive(Debug, Args)]
 #[command(after_help = "Without a run, the latest runs are listed.\n\
-    Exit code 3: the run has ended, and some of its jobs failed for good.\n\
+    Exit code 3: the run has ended, and some of its jobs failed for good; 1, with --watch: it was cancelled.\n\
     Example: planesweep status castle-3 --watch --coordinator http://10.0.0.1:7070")]
 pub struct StatusArgs {
     /// The run, as `submit` named it.
@@ -57,6 +57,9 @@ pub fn run(args: &StatusArgs) -> Result<Outcome> {
         } else {
             client.status(&run, 0).await.context("cannot ask how far the run is")?
         };
+        if args.watch && status.cancelled {
+            bail!("run {run} was cancelled");
+        }
         Ok(describe(&run, &status))
     })
 }

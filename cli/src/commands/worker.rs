@@ -13,7 +13,7 @@ use planesweep_worker::{ExchangeConfig, ExchangeError, WorkerConfig, WorkerError
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
-use crate::args::values::bytes;
+use crate::args::values::{bytes, device};
 use crate::args::{ConnectArgs, ServerTlsArgs};
 use crate::console::Outcome;
 use crate::host;
@@ -45,7 +45,7 @@ pub struct WorkerArgs {
     #[arg(long)]
     pub no_shared_memory: bool,
     /// Where to infer: cpu, torch, cuda or cuda:N; `analytic` is a test double that knows a plane.
-    #[arg(long, default_value = "cpu")]
+    #[arg(long, default_value = "cpu", value_parser = device)]
     pub device: String,
     /// Threads of an inference; by default all processors.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
