@@ -212,3 +212,23 @@ fn what_makes_a_scene_never_writes_into_one() {
     refused(&sample("4"), &format!("{samples}/00000004"));
     assert!(!Path::new(&format!("{samples}/00000005")).exists());
 }
+
+#[test]
+fn usage_errors_name_what_is_expected_and_leave_nothing() {
+    let bench = of_plane(3);
+    let (scene, out) = (bench.scene(), bench.path("none-out"));
+    let refused = |command: &[&str], code: i32, expected: &str| {
+        let refused = run(command).expect_code(code);
+        assert!(refused.stderr.contains(expected), "{}", refused.stderr);
+    };
+    refused(
+        &["reconstruct", &scene, "-o", &out, "--device", "gpu"],
+        2,
+        "none of cpu, torch, cuda and cuda:N",
+    );
+    refused(&["reconstruct", &scene, "-o", &scene], 2, "over the scene");
+    refused(&["submit", &scene, "--coordinator", "http://127.0.0.1:9"], 2, "--detach");
+    refused(&["status", "--coordinator", "foo"], 2, "http://10.0.0.1:7070");
+    refused(&["reconstruct", &bench.path("none"), "-o", &out], 1, "cannot find the scene");
+    assert!(!Path::new(&out).exists());
+}

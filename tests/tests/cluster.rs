@@ -61,6 +61,8 @@ fn a_cluster_gives_the_cloud_of_one_process_and_is_told_to_go() {
     let waiting = run(["status", &id, "--coordinator", &url, "--json"]).expect_code(0).json();
     assert_eq!((&waiting["state"], &waiting["jobs"]["infer"]["open"]), (&"running".into(), &4.into()));
     let _ = run(["cancel", &id, "--coordinator", &url]).expect_code(0);
+    let watched = run(["status", &id, "--watch", "--coordinator", &url]).expect_code(1);
+    assert!(watched.stderr.contains("scene-1 was cancelled"), "{}", watched.stderr);
     let unknown = run(["cancel", "no-such-run", "--coordinator", &url]).expect_code(1);
     assert!(unknown.stderr.contains("no-such-run"), "{}", unknown.stderr);
 
@@ -83,6 +85,9 @@ fn a_cluster_gives_the_cloud_of_one_process_and_is_told_to_go() {
 
     assert!(send("TERM", leaving.pid()));
     let left = leaving.wait().expect_code(TERMINATED);
+    let connected =
+        format!("working for {url} as both; slots: 2 for inference, 2 for fusion; maps are served at ");
+    assert!(left.stderr.contains(&connected), "{}", left.stderr);
     assert!(left.stderr.contains("another worker may take its place"), "{}", left.stderr);
     assert!(cluster.coordinator().is_running());
     let ended = cluster.drain().wait().expect_code(0);

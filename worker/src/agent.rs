@@ -63,6 +63,8 @@ pub struct WorkerConfig {
     pub exchange: ExchangeConfig,
     /// Makes the network.
     pub backend: BackendFactory,
+    /// Called once, when a coordinator has taken the worker, with where its maps are served.
+    pub connected: Box<dyn FnOnce(&str) + Send>,
 }
 
 /// Why a worker ended before its time.
@@ -134,6 +136,7 @@ pub async fn run_worker(config: WorkerConfig, stop: CancellationToken) -> Result
         exchange: Arc::new(exchange),
         jobs: None,
         has_begun_to_open: false,
+        connected: Some(config.connected),
         unopened: Some(Unopened { device, maps, cache_bytes: config.cache_bytes, disk_cache }),
         max_wait: FIRST_WAIT,
         lease_ends: None,
@@ -184,6 +187,7 @@ struct Agent {
     /// Made when the store is found, of which the first reply tells.
     jobs: Option<Arc<Jobs>>,
     has_begun_to_open: bool,
+    connected: Option<Box<dyn FnOnce(&str) + Send>>,
     unopened: Option<Unopened>,
     max_wait: Duration,
     lease_ends: Option<Instant>,
@@ -327,6 +331,9 @@ impl Agent {
     fn apply(&mut self, reply: ReportReply) -> bool {
         if !self.has_begun_to_open {
             self.has_begun_to_open = true;
+            if let (Some(connected), Some(maps)) = (self.connected.take(), self.exchange.endpoint().address) {
+                connected(&maps);
+            }
             self.open(reply.store);
         }
         self.exchange.learn(&reply.peers);

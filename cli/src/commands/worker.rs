@@ -111,6 +111,20 @@ pub fn run(args: WorkerArgs) -> Result<Outcome> {
         RoleArg::Both => Role::Both,
     };
     let host = host::name();
+    let coordinator = args.connect.coordinator.clone();
+    // Those that `reconstruct` starts are its own affair.
+    let is_on_its_own = !args.stop_with_stdin;
+    let connected = Box::new(move |maps: &str| {
+        if is_on_its_own {
+            let Slots { infer, fuse } = SLOTS;
+            let slots = match role {
+                Role::Infer => format!("{infer} for inference"),
+                Role::Fuse => format!("{fuse} for fusion"),
+                Role::Both => format!("{infer} for inference, {fuse} for fusion"),
+            };
+            eprintln!("working for {coordinator} as {role}; slots: {slots}; maps are served at {maps}");
+        }
+    });
     // A new one for every life of the process.
     let nonce = host::unique().context("cannot make an id for this worker")?;
     let config = WorkerConfig {
@@ -125,6 +139,7 @@ pub fn run(args: WorkerArgs) -> Result<Outcome> {
             threads: args.threads.map_or_else(processors, |threads| threads as usize),
             memory_bytes: args.memory,
         })?,
+        connected,
         device: args.device,
         slots: SLOTS,
         cache_bytes: CACHE_BYTES,
