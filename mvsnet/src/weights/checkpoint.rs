@@ -52,6 +52,11 @@ pub enum CheckpointError {
     },
 }
 
+/// Whether the bytes begin as a zip archive or as a pickle of protocol 2 do.
+pub(super) fn looks_like_one(bytes: &[u8]) -> bool {
+    bytes.starts_with(b"PK\x03\x04") || bytes.starts_with(&[0x80, 2])
+}
+
 /// Reads a checkpoint's network: names without the prefix `module.`, without the optimiser and without
 /// the batch counters of batch normalisation.
 pub(super) fn read(bytes: &[u8]) -> Result<BTreeMap<String, WeightTensor>, CheckpointError> {

@@ -69,6 +69,9 @@ fn split(bytes: &[u8]) -> Result<(&[u8], &[u8]), WeightsError> {
     let (len, rest) = bytes.split_first_chunk::<8>().ok_or(WeightsError::NotSafetensors)?;
     let len = u64::from_le_bytes(*len);
     if len > MAX_HEADER_BYTES {
+        if super::checkpoint::looks_like_one(bytes) {
+            return Err(WeightsError::PyTorchCheckpoint);
+        }
         return Err(WeightsError::HugeHeader { bytes: len, limit: MAX_HEADER_BYTES });
     }
     rest.split_at_checked(len as usize).ok_or(WeightsError::NotSafetensors)
@@ -136,6 +139,15 @@ mod tests {
         assert!(
             matches!(Weights::from_bytes(&bytes), Err(WeightsError::HugeHeader { bytes, .. }) if bytes == 1 << 62)
         );
+    }
+
+    #[test]
+    fn checkpoints_are_recognised_and_their_import_is_named() {
+        for bytes in [b"PK\x03\x04\0\0\x08\x08\0\0".as_slice(), b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."] {
+            let error = Weights::from_bytes(bytes).expect_err("a checkpoint");
+            assert!(matches!(error, WeightsError::PyTorchCheckpoint), "{error}");
+            assert!(error.to_string().contains("weights import"), "{error}");
+        }
     }
 
     #[test]

@@ -152,6 +152,11 @@ pub enum WeightsError {
         "not a safetensors file, or cut off within its header; PyTorch checkpoints need `weights import`"
     )]
     NotSafetensors,
+    /// The bytes are a PyTorch checkpoint.
+    #[error(
+        "this is a PyTorch checkpoint: `planesweep weights import FILE -o FILE.safetensors` turns it into weights"
+    )]
+    PyTorchCheckpoint,
     /// The header is too long to be true.
     #[error("the safetensors header claims {bytes} bytes, more than {limit}")]
     HugeHeader {
