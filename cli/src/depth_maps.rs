@@ -10,6 +10,7 @@ use planesweep_scene::{
     read_scene, undistorted_intrinsics,
 };
 
+use crate::input::no_mask_matches;
 use crate::run_record::{FILE_NAME, RunRecord};
 
 /// Depth maps on disk, and who is checked against whom.
@@ -48,13 +49,15 @@ pub fn find(
 ) -> Result<DepthMaps> {
     let is_result = folder.join(FILE_NAME).exists();
     let found = if is_result { of_result(folder, masks)? } else { of_mvsnet_folder(folder, masks, options)? };
-    let Found { files, mut ranking, warnings, without, network_pixel } = found;
+    let Found { files, mut ranking, mut warnings, without, network_pixel } = found;
     if files.is_empty() {
         bail!(
             "no depth map is in {}: depth/, depth_est/ or depths_mvsnet/ with ID.pfm or ID_init.pfm are looked for",
             folder.display()
         );
     }
+    let masked = files.values().filter(|files| files.mask.is_some()).count();
+    warnings.extend(no_mask_matches(masks, masked));
     ranking.retain(|view, _| files.contains_key(view));
     for sources in ranking.values_mut() {
         sources.retain(|source| files.contains_key(&source.view));

@@ -91,6 +91,15 @@ pub fn masks(scene: &Scene, folder: Option<&Path>) -> Result<BTreeMap<ViewId, Ma
         .collect()
 }
 
+/// What to say when the folder of masks that was given has none for any view.
+pub fn no_mask_matches(folder: Option<&Path>, found: usize) -> Option<String> {
+    let folder = folder.filter(|_| found == 0)?;
+    Some(format!(
+        "no view has a mask in {}: NAME.png and STEM.png of the photographs are looked for",
+        folder.display()
+    ))
+}
+
 /// All views without a depth map: those left out when reading, and those that the plan skips.
 pub fn all_skipped(input: &Input, plan: &Plan) -> Vec<Skipped> {
     let planned = plan.skipped.iter().map(|(view, reason)| Skipped {

@@ -70,6 +70,9 @@ impl Prepared {
         }
         let mut plan = timed(stages, "plan", || Ok(plan(&input.scene, options)))?;
         plan.masks = input::masks(&input.scene, masks)?;
+        if let Some(warning) = input::no_mask_matches(masks, plan.masks.len()) {
+            eprintln!("warning: {warning}");
+        }
         if plan.views.is_empty() {
             bail!("no view can be reconstructed; `planesweep inspect {}` says why", scene.display());
         }

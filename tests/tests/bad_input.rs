@@ -232,3 +232,23 @@ fn usage_errors_name_what_is_expected_and_leave_nothing() {
     refused(&["reconstruct", &bench.path("none"), "-o", &out], 1, "cannot find the scene");
     assert!(!Path::new(&out).exists());
 }
+
+#[test]
+fn masks_that_belong_to_no_view_are_warned_of() {
+    let bench = of_plane(4);
+    let masks = bench.path("masks");
+    fs::create_dir_all(&masks).expect("made");
+    fs::write(format!("{masks}/foo.png"), b"").expect("written");
+    let more: Vec<&str> = ANALYTIC.into_iter().chain(["--masks", &masks]).collect();
+    let out = bench.path("out");
+    let warned = bench.reconstruct("out", &more).expect_code(0);
+    let cloud = bench.path("again.ply");
+    let fuse = ["fuse", &out, "-o", &cloud, "--min-views", "1", "--min-confidence", "0", "--masks", &masks];
+    for run in [warned, run(fuse).expect_code(0)] {
+        assert!(
+            run.stderr.contains("no view has a mask in") && run.stderr.contains(&masks),
+            "{}",
+            run.stderr
+        );
+    }
+}
