@@ -5,7 +5,9 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 use planesweep_plan::{BlobKey, MaskSpec, Plan};
-use planesweep_scene::{ReadOptions, Scene, ViewId, decode_image, find_mask, read_scene};
+use planesweep_scene::{
+    ReadError, ReadOptions, Scene, ViewId, decode_image, find_mask, first_reasons, read_scene, scenes_below,
+};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -33,8 +35,15 @@ pub struct Input {
 pub fn read(path: &Path, options: &ReadOptions) -> Result<Input> {
     // Workers, and runs that resume, may have another working folder.
     let root = path.canonicalize().with_context(|| format!("cannot find the scene {}", path.display()))?;
-    let mut scene =
-        read_scene(&root, options).with_context(|| format!("cannot read the scene {}", path.display()))?;
+    let mut scene = read_scene(&root, options).map_err(|error| {
+        let near = match error {
+            ReadError::NoScene { .. } | ReadError::NoImages { .. } => scenes_below(path),
+            _ => Vec::new(),
+        };
+        let hint = near.first().map(|near| format!(" (there is one in {})", near.display()));
+        let hint = hint.unwrap_or_default();
+        anyhow::Error::new(error).context(format!("cannot read the scene {}{hint}", path.display()))
+    })?;
     let mut skipped: Vec<Skipped> = scene
         .skipped
         .iter()
@@ -67,7 +76,8 @@ pub fn read(path: &Path, options: &ReadOptions) -> Result<Input> {
         }
     }
     if scene.views.is_empty() {
-        bail!("no image of {} can be decoded", path.display());
+        let reasons = first_reasons(skipped.iter().map(|view| (&view.view, &view.reason)));
+        bail!("no image of {} can be decoded{reasons}", path.display());
     }
     Ok(Input { scene, image_hashes, skipped })
 }

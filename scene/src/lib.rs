@@ -26,6 +26,7 @@ mod jpeg;
 mod pfm;
 mod raster;
 mod read;
+mod reasons;
 mod scene;
 mod stitch;
 mod training_sample;
@@ -45,8 +46,9 @@ pub use pfm::{PfmError, PfmFormatError, decode_pfm, encode_pfm, read_depth_pfm, 
 pub use raster::{Raster, RasterError};
 pub use read::{
     DepthLine, NameError, PixelCentre, ReadError, ReadOptions, ResolveError, SceneFormat, ViewError,
-    read_mvsnet_cam, read_mvsnet_pairs, read_scene, resolve_inside, safe_name,
+    read_mvsnet_cam, read_mvsnet_pairs, read_scene, resolve_inside, safe_name, scenes_below,
 };
+pub use reasons::first_reasons;
 pub use scene::{DepthRange, Scene, SourceScore, SparsePoints, View, Warning};
 pub use stitch::StitchError;
 pub use training_sample::TrainingSample;

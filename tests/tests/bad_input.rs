@@ -252,3 +252,34 @@ fn masks_that_belong_to_no_view_are_warned_of() {
         );
     }
 }
+
+#[test]
+fn a_scene_without_a_usable_view_says_why() {
+    let bench = Bench::new(|folder| courtyard(folder, 5, 64, 64));
+    let images = bench.path("scene/images");
+    fs::remove_dir_all(&images).expect("it was there");
+    fs::create_dir_all(&images).expect("made");
+    let refused = run(["inspect", &bench.scene()]).expect_code(1);
+    for part in ["found no usable view", "00000000.png: ", "and 2 more"] {
+        assert!(refused.stderr.contains(part), "{part}: {}", refused.stderr);
+    }
+}
+
+#[test]
+fn a_scene_below_is_named() {
+    let bench = of_plane(3);
+    let above = bench.path("");
+    let refused = run(["inspect", &above]).expect_code(1);
+    assert!(refused.stderr.contains(&format!("there is one in {}", bench.scene())), "{}", refused.stderr);
+}
+
+#[test]
+fn maps_whose_photographs_are_gone_are_named_with_the_reason() {
+    let bench = of_plane(4);
+    let _ = bench.reconstruct("out", &ANALYTIC).expect_code(0);
+    fs::remove_dir_all(bench.path("scene/images")).expect("it was there");
+    let refused = run(["fuse", &bench.path("out"), "-o", &bench.path("again.ply")]).expect_code(1);
+    for part in ["no view of", "could be read", "00000000.png: could not read image", "and 1 more"] {
+        assert!(refused.stderr.contains(part), "{part}: {}", refused.stderr);
+    }
+}

@@ -13,7 +13,7 @@ use planesweep_fusion::{
     Work, fuse_out_of_core,
 };
 use planesweep_plan::{BlobKey, NUMERICS_VERSION};
-use planesweep_scene::{DepthFiles, DepthMap, ViewId};
+use planesweep_scene::{DepthFiles, DepthMap, ViewId, first_reasons};
 use serde_json::json;
 
 use crate::args::values::bytes;
@@ -142,9 +142,13 @@ pub fn run(args: &FuseArgs, json: bool) -> Result<Outcome> {
     progress.finish();
     let funnel: Funnel = fused.funnels.values().copied().sum();
     if let Some(empty) = funnel.emptied_by() {
-        let read = fused.skipped.iter().next();
-        let why = read.map(|(view, why)| format!("; view {view}: {why}")).unwrap_or_default();
-        bail!("{empty}{why}");
+        let reasons =
+            first_reasons(fused.skipped.iter().map(|(view, why)| (&maps.files[view].view.name, why)));
+        if fused.funnels.is_empty() {
+            bail!("no view of {} could be read{reasons}", args.folder.display());
+        }
+        let left_out = if reasons.is_empty() { "" } else { "; left out" };
+        bail!("{empty}{left_out}{reasons}");
     }
     workspace.map(Workspace::finish).transpose()?;
     outputs.finish()?;

@@ -85,6 +85,27 @@ impl SceneFormat {
     }
 }
 
+/// The scenes in folders one or two below this one, in the order of their names.
+pub fn scenes_below(folder: &Path) -> Vec<PathBuf> {
+    let below = folders_in(folder);
+    let mut folders: Vec<PathBuf> =
+        below.iter().flat_map(|child| folders_in(child)).chain(below.clone()).collect();
+    folders.retain(|folder| is_whole(folder));
+    folders.sort();
+    folders
+}
+
+fn folders_in(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    entries.map(|entry| entry.path()).filter(|path| path.is_dir()).collect()
+}
+
+/// Whether there is a scene, and with its photographs where these have their place.
+fn is_whole(folder: &Path) -> bool {
+    find(folder, None)
+        .is_ok_and(|found| found.format != SceneFormat::Colmap || folder.join("images").is_dir())
+}
+
 /// What to read, and how.
 pub(super) struct Found {
     pub format: SceneFormat,

@@ -16,17 +16,18 @@ mod pairs;
 mod points;
 mod views;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-pub use detect::SceneFormat;
+pub use detect::{SceneFormat, scenes_below};
 pub use mvsnet::{read_mvsnet_cam, read_mvsnet_pairs};
 pub use names::{NameError, ResolveError, resolve_inside, safe_name};
 
-use crate::{CameraError, Scene, SizeMismatch};
+use crate::{CameraError, Scene, SizeMismatch, first_reasons};
 
 /// What a reader cannot know from the files.
 #[derive(Clone, Debug, PartialEq)]
@@ -160,10 +161,12 @@ pub enum ReadError {
         source: ViewError,
     },
     /// No view is left.
-    #[error("found no usable view in {}", path.display())]
+    #[error("found no usable view in {}{}", path.display(), first_reasons(skipped))]
     NoViews {
         /// The scene.
         path: PathBuf,
+        /// The views that were skipped, each with the reason.
+        skipped: BTreeMap<String, String>,
     },
 }
 
@@ -210,7 +213,7 @@ pub fn read_scene(path: &Path, options: &ReadOptions) -> Result<Scene, ReadError
         SceneFormat::OpenMvs => openmvs::read(&found.path, options)?,
     };
     if scene.views.is_empty() {
-        return Err(ReadError::NoViews { path: path.to_owned() });
+        return Err(ReadError::NoViews { path: path.to_owned(), skipped: scene.skipped });
     }
     Ok(scene)
 }
@@ -245,5 +248,21 @@ mod tests {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let error = read_scene(folder.path(), &ReadOptions::default()).expect_err("empty");
         assert!(matches!(&error, ReadError::NoScene { path } if path == folder.path()), "{error}");
+    }
+
+    #[test]
+    fn scenes_one_or_two_folders_below_are_found_when_they_are_whole() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let make = |name: &str| fs::create_dir_all(folder.path().join(name)).expect("made");
+        for name in
+            ["dense/0/images", "dense/0/sparse", "no_photographs/sparse", "a/b/c/images", "a/b/c/cams"]
+        {
+            make(name);
+        }
+        for name in ["dense/0", "no_photographs"] {
+            fs::write(folder.path().join(name).join("sparse/images.bin"), b"").expect("written");
+        }
+        assert_eq!(scenes_below(folder.path()), [folder.path().join("dense/0")]);
+        assert_eq!(scenes_below(&folder.path().join("dense")), [folder.path().join("dense/0")]);
     }
 }
