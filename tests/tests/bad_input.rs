@@ -266,6 +266,29 @@ fn a_scene_without_a_usable_view_says_why() {
 }
 
 #[test]
+fn truth_that_is_not_there_is_named() {
+    let bench = of_plane(4);
+    let _ = bench.reconstruct("out", &ANALYTIC).expect_code(0);
+    let nowhere = bench.path("nowhere");
+    let refused = run(["evaluate", "depth", &bench.path("out"), &nowhere]).expect_code(1);
+    assert!(refused.stderr.contains(&format!("cannot find the folder {nowhere}")), "{}", refused.stderr);
+}
+
+#[test]
+fn weights_are_described_by_the_names_of_the_options() {
+    let bench = of_plane(3);
+    let described = run(["weights", "inspect", &bench.weights()]).expect_code(0).stdout;
+    let value = run(["weights", "inspect", &bench.weights(), "--json"]).expect_code(0).json();
+    for field in ["normalization", "refinement", "metric"] {
+        let name = value["metadata"][field].as_str().expect("a name");
+        assert!(
+            described.lines().any(|line| line.split_whitespace().last() == Some(name)),
+            "{name}: {described}"
+        );
+    }
+}
+
+#[test]
 fn a_scene_below_is_named() {
     let bench = of_plane(3);
     let above = bench.path("");

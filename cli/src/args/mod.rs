@@ -70,10 +70,16 @@ pub enum Command {
     /// Render depth maps of a triangle mesh, as training data.
     RenderDepth(RenderDepthArgs),
     /// Import or inspect weights of the network.
-    #[command(subcommand)]
+    #[command(
+        subcommand,
+        after_help = "Example: planesweep weights import model_000014.ckpt -o mvsnet.safetensors"
+    )]
     Weights(WeightsCommand),
     /// Measure how good a result is.
-    #[command(subcommand)]
+    #[command(
+        subcommand,
+        after_help = "Example: planesweep evaluate depth demo/out demo/scene/depth_gt -o demo/evaluation"
+    )]
     Evaluate(EvaluateCommand),
     /// Measure how fast the network is on this machine, ours against libtorch.
     Bench(BenchArgs),
@@ -103,6 +109,18 @@ mod tests {
     #[test]
     fn the_command_line_is_consistent() {
         Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn every_command_has_an_example() {
+        fn check(command: &clap::Command) {
+            for command in command.get_subcommands().filter(|c| !c.is_hide_set() && c.get_name() != "help") {
+                let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+                assert!(help.contains("Example: planesweep "), "{}", command.get_name());
+                check(command);
+            }
+        }
+        check(&Cli::command());
     }
 
     #[test]

@@ -18,6 +18,7 @@ pub enum WeightsCommand {
     /// Turn a checkpoint of the public PyTorch MVSNet into safetensors; no code in it is ever run.
     Import(ImportArgs),
     /// Say what a weights file holds.
+    #[command(after_help = "Example: planesweep weights inspect mvsnet.safetensors")]
     Inspect {
         /// The file.
         file: PathBuf,
@@ -90,14 +91,16 @@ fn describe(file: &Path, bytes: &[u8], weights: &Weights) -> Outcome {
     let metadata = weights.metadata();
     let values: usize = weights.tensors().values().map(|tensor| tensor.values.len()).sum();
     let hash = BlobKey::of(bytes);
+    let known = json!(metadata);
+    let named = |field: &str| known[field].as_str().unwrap_or_default();
     let text = format!(
-        "{}: {} tensors, {values} values\nblake3         {hash}\nnormalisation  {:?}\nrefinement     {:?}\n\
-         cost metric    {:?}\nsource         {}\nlicence        {}\n",
+        "{}: {} tensors, {values} values\nblake3         {hash}\nnormalisation  {}\nrefinement     {}\n\
+         cost metric    {}\nsource         {}\nlicence        {}\n",
         file.display(),
         weights.tensors().len(),
-        metadata.normalization,
-        metadata.refinement,
-        metadata.metric,
+        named("normalization"),
+        named("refinement"),
+        named("metric"),
         metadata.source,
         metadata.licence,
     );
@@ -106,7 +109,7 @@ fn describe(file: &Path, bytes: &[u8], weights: &Weights) -> Outcome {
         "blake3": hash.to_string(),
         "tensors": weights.tensors().len(),
         "values": values,
-        "metadata": metadata,
+        "metadata": known,
     });
     Outcome { text, value, skipped_views: false }
 }

@@ -45,6 +45,9 @@ struct Measured {
 /// Compares the depth maps of a result with true ones.
 pub fn run(args: &DepthArgs) -> Result<Outcome> {
     let record = RunRecord::read(&args.result)?;
+    if !args.truth.is_dir() {
+        bail!("cannot find the folder {} with true depth", args.truth.display());
+    }
     let measured: Vec<Option<Measured>> =
         record.views.par_iter().map(|view| measure(args, view)).collect::<Result<_>>()?;
     let measured: Vec<Measured> = measured.into_iter().flatten().collect();
