@@ -36,6 +36,9 @@ const SHORTEST_PAUSE: Duration = Duration::from_millis(20);
 /// Pauses between attempts to reach the coordinator: doubled up to the longest.
 const RECONNECT: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(2));
 
+/// Is told where the maps of a worker are served.
+pub type ConnectedHook = Box<dyn FnOnce(&str) + Send>;
+
 /// What a worker is told when it starts.
 pub struct WorkerConfig {
     /// The coordinator, such as `http://127.0.0.1:7070`; with commas between, several that share a ledger: the
@@ -64,7 +67,7 @@ pub struct WorkerConfig {
     /// Makes the network.
     pub backend: BackendFactory,
     /// Called once, when a coordinator has taken the worker, with where its maps are served.
-    pub connected: Box<dyn FnOnce(&str) + Send>,
+    pub connected: ConnectedHook,
 }
 
 /// Why a worker ended before its time.
@@ -187,7 +190,7 @@ struct Agent {
     /// Made when the store is found, of which the first reply tells.
     jobs: Option<Arc<Jobs>>,
     has_begun_to_open: bool,
-    connected: Option<Box<dyn FnOnce(&str) + Send>>,
+    connected: Option<ConnectedHook>,
     unopened: Option<Unopened>,
     max_wait: Duration,
     lease_ends: Option<Instant>,

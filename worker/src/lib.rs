@@ -34,7 +34,7 @@ mod weights;
 
 use planesweep_store as store;
 
-pub use agent::{WorkerConfig, WorkerError, run_worker};
+pub use agent::{ConnectedHook, WorkerConfig, WorkerError, run_worker};
 pub use blob::{BlobError, decode_depth_map};
 pub use device::BackendFactory;
 pub use exchange::{ExchangeConfig, ExchangeError};
