@@ -5,6 +5,7 @@ use std::io::{IsTerminal, stderr};
 use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde::Serialize;
 use serde_json::Value;
 use tracing_subscriber::EnvFilter;
 
@@ -29,6 +30,11 @@ impl fmt::Display for UsageError {
 }
 
 impl std::error::Error for UsageError {}
+
+/// As JSON; unlike `json!`, which makes them doubles, with floats as short as they tell themselves apart.
+pub fn shortest<T: Serialize>(value: &T) -> Value {
+    serde_json::to_string(value).and_then(|text| serde_json::from_str(&text)).unwrap_or_default()
+}
 
 /// Sends logs to stderr: warnings, with `-v` more; `PLANESWEEP_LOG` overrides both.
 pub fn start_logging(verbose: u8) {
@@ -144,6 +150,11 @@ mod tests {
     #[test]
     fn one_is_no_plural() {
         assert_eq!([counted(1, "worker"), counted(2, "worker")], ["1 worker", "2 workers"]);
+    }
+
+    #[test]
+    fn floats_are_written_as_they_were_given() {
+        assert_eq!(shortest(&[0.8_f32, 0.01]).to_string(), "[0.8,0.01]");
     }
 
     #[test]

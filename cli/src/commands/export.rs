@@ -23,7 +23,7 @@ use rayon::prelude::*;
 use serde_json::json;
 use tokio::runtime::Runtime;
 
-use crate::console::Outcome;
+use crate::console::{Outcome, shortest};
 use crate::input::{Skipped, all_skipped};
 use crate::out_folder::{OutFolder, depth_range, trajectory};
 use crate::prepare::{Prepared, Stages};
@@ -346,10 +346,10 @@ fn report(
         ("each surface is emitted once", json!(options.once_per_surface)),
         ("full resolution", json!(options.full_resolution)),
         ("views with a mask", json!(run.prepared.plan.masks.len())),
-        ("confidence threshold", json!(filter.min_confidence)),
+        ("confidence threshold", shortest(&filter.min_confidence)),
         ("views that must agree, reference included", json!(filter.min_views)),
-        ("reprojection threshold in pixels of the depth map", json!(filter.max_reprojection_px)),
-        ("relative depth threshold", json!(filter.max_relative_depth)),
+        ("reprojection threshold in pixels of the depth map", shortest(&filter.max_reprojection_px)),
+        ("relative depth threshold", shortest(&filter.max_relative_depth)),
         ("fusion neighbours", json!(options.fusion_views)),
         ("device", json!(run.prepared.network.device)),
         ("weights", json!(run.prepared.network.file)),

@@ -18,7 +18,7 @@ use serde_json::json;
 
 use crate::args::values::bytes;
 use crate::args::{FilterArgs, ReadArgs};
-use crate::console::{Outcome, Progress};
+use crate::console::{Outcome, Progress, shortest};
 use crate::depth_maps::{self, DepthMaps, Neighbourhood};
 use crate::out_folder::make_folder_of;
 use crate::workspace::Workspace;
@@ -286,7 +286,7 @@ fn outcome(
     let value = json!({
         "out": args.out,
         "points": funnel.emitted,
-        "options": options,
+        "options": shortest(&options),
         "funnel": funnel,
         "views": funnels,
         "skipped": skipped,
