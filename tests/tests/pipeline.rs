@@ -232,7 +232,7 @@ fn wrong_arguments_are_usage_and_name_themselves() {
     let _ = run(["--help"]).expect_code(0);
 
     let bench = of_plane();
-    let device = bench.reconstruct("out", &["--device", "abacus"]).expect_code(1);
+    let device = bench.reconstruct("out", &["--device", "abacus"]).expect_code(2);
     assert!(device.stderr.contains("abacus"), "{}", device.stderr);
     assert!(!Path::new(&bench.path("out")).exists());
 }
