@@ -18,6 +18,12 @@ const ANALYTIC_DEPTH: f64 = 5.0;
 /// What stands for the weights of the test double, so that its results are never taken for real ones.
 const ANALYTIC_WEIGHTS: &[u8] = b"analytic backend";
 
+/// Whether this names a device; whether there is one shows when it is used.
+pub fn is_device(name: &str) -> bool {
+    let is_numbered = name.strip_prefix("cuda:").is_some_and(|number| number.parse::<u32>().is_ok());
+    is_numbered || ["cpu", "torch", "cuda", ANALYTIC].contains(&name)
+}
+
 /// The bytes that the device loads its network from.
 pub fn weights_for(device: &str, weights: Vec<u8>) -> Vec<u8> {
     if device == ANALYTIC { ANALYTIC_WEIGHTS.to_vec() } else { weights }

@@ -46,10 +46,11 @@ impl Workspace {
         maps: &Path,
         mut photographs: impl Iterator<Item = &'a Path>,
     ) -> Result<Self> {
+        let found = root.canonicalize();
         let within = |photograph: &Path| {
-            photograph
-                .canonicalize()
-                .is_ok_and(|path| root.canonicalize().is_ok_and(|root| path.starts_with(root)))
+            found
+                .as_ref()
+                .is_ok_and(|root| photograph.canonicalize().is_ok_and(|path| path.starts_with(root)))
         };
         if is_scene(&root, maps) || photographs.any(within) {
             bail!(UsageError(format!(

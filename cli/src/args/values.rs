@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use crate::network::is_device;
+
 /// A number from 0 to 1.
 pub fn share(text: &str) -> Result<f32, String> {
     let value: f32 = text.parse().map_err(|_| format!("{text} is not a number"))?;
@@ -56,11 +58,9 @@ pub fn seconds(text: &str) -> Result<Duration, String> {
     if duration.is_zero() { Err(format!("{text} is not positive")) } else { Ok(duration) }
 }
 
-/// Where to infer; whether it is there shows when it is used.
+/// Where to infer.
 pub fn device(text: &str) -> Result<String, String> {
-    let is_numbered = text.strip_prefix("cuda:").is_some_and(|number| number.parse::<u32>().is_ok());
-    // The last one is the test double.
-    if is_numbered || ["cpu", "torch", "cuda", "analytic"].contains(&text) {
+    if is_device(text) {
         Ok(text.to_owned())
     } else {
         Err("it is none of cpu, torch, cuda and cuda:N".to_owned())
