@@ -51,7 +51,7 @@ pub fn photometric_error(
                     let point = map.camera.unproject(&Point2::new(x as f64, y as f64), f64::from(depth));
                     let (pixel, _) = held_out.project(&point)?;
                     let there = bilinear(held_out_colors, pixel)?;
-                    let here = map.color.at(x, y);
+                    let here = map.rgb(x, y);
                     let difference: f64 =
                         here.iter().zip(there).map(|(a, b)| (f64::from(*a) - b).abs()).sum();
                     Some((map.confidence.at(x, y), difference / 3.0))

@@ -66,6 +66,15 @@ fn methods(maps: &[DepthMap], methods: &[FusionMethod], runs: usize) {
     let mut times = vec![(Vec::new(), Vec::new(), 0.0); methods.len()];
     let mut emit_ms = Vec::new();
     let (mut kept, mut kept_points) = (None, None);
+    // Of each view: emission asks all of them.
+    let filtered: Vec<FilteredMap> = (0..maps.len())
+        .map(|view| {
+            let others: Vec<&DepthMap> =
+                maps.iter().enumerate().filter(|(other, _)| *other != view).map(|(_, map)| map).collect();
+            filter(&maps[view], &others, &FilterOptions::default())
+        })
+        .collect();
+    let others: Vec<&FilteredMap> = filtered[1..].iter().collect();
     for _ in 0..runs {
         for (method, (all, one, cpu)) in methods.iter().zip(&mut times) {
             let run = || black_box(fuse(maps, *method));
@@ -74,10 +83,8 @@ fn methods(maps: &[DepthMap], methods: &[FusionMethod], runs: usize) {
             one.push(pool.install(|| milliseconds(&mut kept, run)));
             *cpu += cpu_milliseconds() - before;
         }
-        let filtered = fuse(maps, FusionMethod::Consistency);
-        let others = [&filtered; NEIGHBOURS];
         emit_ms.push(milliseconds(&mut kept_points, || {
-            encode(&emit(&filtered, &emitted(&filtered, &others, 0.01)), VertexFormat::default())
+            encode(&emit(&filtered[0], &emitted(&filtered[0], &others, 0.01)), VertexFormat::default())
         }));
     }
     for (method, (all, one, cpu)) in methods.iter().zip(&times) {

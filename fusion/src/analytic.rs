@@ -1,7 +1,7 @@
 //! Scenes whose depth is known by formula, for the tests of this crate.
 
 use nalgebra::{Point2, Point3, Vector3};
-use planesweep_scene::{Camera, DepthMap, Intrinsics, Pose, Raster};
+use planesweep_scene::{Camera, DepthMap, Intrinsics, Pose, Raster, in_255ths};
 
 /// A surface that a ray meets, or not.
 #[derive(Clone, Copy)]
@@ -40,6 +40,13 @@ impl Surface {
         });
         DepthMap::new(camera, depth, Raster::filled(width, height, 1.0), color).expect("sizes agree")
     }
+}
+
+/// Changes how sure a map is of a pixel.
+pub(crate) fn set_confidence(map: &mut DepthMap, x: usize, y: usize, confidence: f32) {
+    let index = y * map.width() + x;
+    map.confidence.values_mut()[index] = confidence;
+    map.color.values_mut()[index][3] = in_255ths(confidence);
 }
 
 /// A camera of `width` by `height` at `(x, y, -3)` that looks at the origin.

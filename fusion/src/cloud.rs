@@ -34,11 +34,12 @@ pub fn emit(map: &FilteredMap, emitted: &Raster<bool>) -> Vec<Point> {
     let point = |index: usize| {
         let (x, y) = (index % columns, index / columns);
         let pixel = Point2::new(x as f64, y as f64);
+        let [r, g, b, confidence] = map.color.at(x, y);
         Point {
             position: map.camera.unproject(&pixel, map.depth.at(x, y) as f64).into(),
             normal: frame.world_normal(x, y),
-            color: map.color.at(x, y),
-            confidence: map.confidence.at(x, y) as f32 / 255.0,
+            color: [r, g, b],
+            confidence: confidence as f32 / 255.0,
             views: map.views.at(x, y),
             seen_by: map.agreeing.at(x, y),
         }
@@ -70,7 +71,7 @@ mod tests {
         }
         let last = map.camera.unproject(&Point2::new(11.0, 8.0), map.depth.at(11, 8) as f64);
         assert!((last.x - points[106].position[0]).abs() < 1e-9);
-        assert_eq!(points[5].color, map.color.at(6, 0));
+        assert_eq!(points[5].color, map.rgb(6, 0));
         assert_eq!((points[5].confidence, points[5].views), (1.0, 1));
     }
 }

@@ -3,7 +3,7 @@
 //! ```text
 //! magic 8 | width u32 | height u32 | fx fy skew cx cy f64 | R 9 x f64 (by columns) | t 3 x f64
 //!         | funnel 6 x u64 | views u8 each | kept: bits
-//!         | of the kept pixels: depth f32 each | RGB each | confidence u8 each | agreeing u64 each | owns: bits
+//!         | of the kept pixels: depth f32 each | RGB and confidence u8 each | agreeing u64 each | owns: bits
 //! ```
 //!
 //! Pixels go row by row from the top, bits from the lowest on; all is little-endian.
@@ -15,11 +15,11 @@ use thiserror::Error;
 use crate::filter::FilteredMap;
 use crate::funnel::Funnel;
 
-const MAGIC: [u8; 8] = *b"PSFILTR2";
+const MAGIC: [u8; 8] = *b"PSFILTR3";
 /// Longest side of a map that is read; a header that says more is damaged.
 const MAX_SIDE: u32 = 1 << 17;
 /// Bytes of a kept pixel, less its bits.
-const KEPT_BYTES: usize = 4 + 3 + 1 + 8;
+const KEPT_BYTES: usize = 4 + 4 + 8;
 
 /// Why bytes are no filtered map.
 #[derive(Debug, Error, PartialEq)]
@@ -42,8 +42,9 @@ pub enum FilteredMapError {
 
 /// A filtered map as bytes.
 pub fn encode_filtered_map(map: &FilteredMap) -> Vec<u8> {
-    let pixels = map.depth.values().len();
-    let mut bytes = Vec::with_capacity(256 + 2 * pixels + KEPT_BYTES * map.funnel.geometric as usize);
+    let (depths, colors, agreeing) = (map.depth.values(), map.color.values(), map.agreeing.values());
+    let kept = kept_pixels(depths);
+    let mut bytes = Vec::with_capacity(256 + 2 * depths.len() + (KEPT_BYTES + 1) * kept.len());
     bytes.extend_from_slice(&MAGIC);
     let k = &map.camera.intrinsics;
     bytes.extend_from_slice(&k.width.to_le_bytes());
@@ -58,14 +59,26 @@ pub fn encode_filtered_map(map: &FilteredMap) -> Vec<u8> {
         bytes.extend_from_slice(&count.to_le_bytes());
     }
     bytes.extend_from_slice(map.views.values());
-    let kept: Vec<usize> = (0..pixels).filter(|i| map.depth.values()[*i] > 0.0).collect();
-    put_bits(&mut bytes, map.depth.values().iter().map(|depth| *depth > 0.0));
-    bytes.extend(kept.iter().flat_map(|i| map.depth.values()[*i].to_le_bytes()));
-    bytes.extend(kept.iter().flat_map(|i| map.color.values()[*i]));
-    bytes.extend(kept.iter().map(|i| map.confidence.values()[*i]));
-    bytes.extend(kept.iter().flat_map(|i| map.agreeing.values()[*i].to_le_bytes()));
-    put_bits(&mut bytes, kept.iter().map(|i| map.owns.values()[*i]));
+    put_bits(&mut bytes, depths.len(), |i| depths[i] > 0.0);
+    put_each(&mut bytes, &kept, |i| depths[i].to_le_bytes());
+    put_each(&mut bytes, &kept, |i| colors[i]);
+    put_each(&mut bytes, &kept, |i| agreeing[i].to_le_bytes());
+    let owns = map.owns.values();
+    put_bits(&mut bytes, kept.len(), |slot| owns[kept[slot]]);
     bytes
+}
+
+/// Indices of the pixels that have a depth.
+fn kept_pixels(depths: &[f32]) -> Vec<usize> {
+    // Written for each pixel, and kept where it counts: there is no branch to be guessed.
+    let mut kept = vec![0; depths.len()];
+    let mut count = 0;
+    for (i, depth) in depths.iter().enumerate() {
+        kept[count] = i;
+        count += usize::from(*depth > 0.0);
+    }
+    kept.truncate(count);
+    kept
 }
 
 /// A filtered map from [`encode_filtered_map`]'s bytes.
@@ -97,45 +110,72 @@ pub fn decode_filtered_map(bytes: &[u8]) -> Result<FilteredMap, FilteredMapError
     }
     let views = reader.take(pixels)?;
     let kept_bits = reader.take(pixels.div_ceil(8))?;
-    let kept: Vec<usize> = (0..pixels).filter(|i| bit(kept_bits, *i)).collect();
+    let kept = set_bits(kept_bits, pixels);
     let expected = kept.len() * KEPT_BYTES + kept.len().div_ceil(8);
     if reader.rest.len() != expected {
         return Err(reader.wrong_length(expected));
     }
     let (depths, _) = reader.take(4 * kept.len())?.as_chunks::<4>();
-    let (colors, _) = reader.take(3 * kept.len())?.as_chunks::<3>();
-    let confidences = reader.take(kept.len())?;
+    let (colors, _) = reader.take(4 * kept.len())?.as_chunks::<4>();
     let (agreeing, _) = reader.take(8 * kept.len())?.as_chunks::<8>();
     let owns = reader.rest;
     let (columns, rows) = (width as usize, height as usize);
     let mut map = FilteredMap {
         camera: Camera { intrinsics, pose },
         depth: Raster::filled(columns, rows, 0.0),
-        color: Raster::filled(columns, rows, [0; 3]),
-        views: Raster::from_fn(columns, rows, |x, y| views[y * columns + x]),
-        confidence: Raster::filled(columns, rows, 0),
+        color: Raster::filled(columns, rows, [0; 4]),
+        views: Raster::new(columns, rows, views.to_vec()).expect("as many bytes as pixels"),
         agreeing: Raster::filled(columns, rows, 0),
         owns: Raster::filled(columns, rows, false),
         funnel,
     };
-    for (slot, i) in kept.into_iter().enumerate() {
-        map.depth.values_mut()[i] = f32::from_le_bytes(depths[slot]);
-        map.color.values_mut()[i] = colors[slot];
-        map.confidence.values_mut()[i] = confidences[slot];
-        map.agreeing.values_mut()[i] = u64::from_le_bytes(agreeing[slot]);
-        map.owns.values_mut()[i] = bit(owns, slot);
-    }
+    put_at(map.depth.values_mut(), &kept, |slot| f32::from_le_bytes(depths[slot]));
+    put_at(map.color.values_mut(), &kept, |slot| colors[slot]);
+    put_at(map.agreeing.values_mut(), &kept, |slot| u64::from_le_bytes(agreeing[slot]));
+    put_at(map.owns.values_mut(), &kept, |slot| bit(owns, slot));
     Ok(map)
 }
 
-fn put_bits(bytes: &mut Vec<u8>, mut bits: impl Iterator<Item = bool>) {
-    while let Some(first) = bits.next() {
-        let mut byte = u8::from(first);
-        for shift in 1..8 {
-            byte |= u8::from(bits.next().unwrap_or(false)) << shift;
-        }
-        bytes.push(byte);
+/// `count` bits, the last byte filled up with zeros.
+fn put_bits(bytes: &mut Vec<u8>, count: usize, bit: impl Fn(usize) -> bool) {
+    let whole = count / 8;
+    let byte = |first: usize, bits: usize| {
+        (0..bits).fold(0, |byte, shift| byte | u8::from(bit(first + shift)) << shift)
+    };
+    bytes.extend((0..whole).map(|index| byte(8 * index, 8)));
+    bytes.extend((count > 8 * whole).then(|| byte(8 * whole, count - 8 * whole)));
+}
+
+/// What `of` says of each of the pixels, in their order.
+fn put_each<const N: usize>(bytes: &mut Vec<u8>, pixels: &[usize], of: impl Fn(usize) -> [u8; N]) {
+    let start = bytes.len();
+    bytes.resize(start + N * pixels.len(), 0);
+    let (slots, _) = bytes[start..].as_chunks_mut::<N>();
+    for (slot, pixel) in slots.iter_mut().zip(pixels) {
+        *slot = of(*pixel);
     }
+}
+
+/// Gives each of the pixels what is in its slot.
+fn put_at<T>(values: &mut [T], pixels: &[usize], slot: impl Fn(usize) -> T) {
+    for (index, pixel) in pixels.iter().enumerate() {
+        values[*pixel] = slot(index);
+    }
+}
+
+/// Indices of the bits that are set, of the first `count`.
+fn set_bits(bytes: &[u8], count: usize) -> Vec<usize> {
+    let mut set = Vec::with_capacity(bytes.iter().map(|byte| byte.count_ones() as usize).sum());
+    for (index, byte) in bytes.iter().enumerate() {
+        let mut left = *byte;
+        while left != 0 {
+            set.push(8 * index + left.trailing_zeros() as usize);
+            left &= left - 1;
+        }
+    }
+    // Bits that fill up the last byte are zeros, unless it is damaged.
+    set.truncate(set.partition_point(|index| *index < count));
+    set
 }
 
 fn bit(bytes: &[u8], index: usize) -> bool {

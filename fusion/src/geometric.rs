@@ -15,17 +15,16 @@ use crate::surface::Rival;
 const OUTSIDE: f32 = -2.0;
 /// Sides from which on `f32` does not tell columns apart; larger maps are not read.
 const MAX_SIDE: usize = 1 << 24;
-/// Pixels from which on their bytes are beyond an index of 32 bits; larger maps are not read.
+/// Pixels from which on an index of 32 bits does not do for all arithmetic with them; larger maps are not read.
 const MAX_PIXELS: usize = 1 << 29;
 
 /// A neighbour as the criterion needs it.
 pub(crate) struct Neighbour<'a> {
     /// Its depth map.
     pub map: &'a DepthMap,
-    /// The map's rasters, all of its size; colours and confidences are empty where it is too large to be read.
+    /// The map's rasters, all of its size; colours are empty where it is too large to be read.
     pub depth: &'a [f32],
-    pub confidence: &'a [f32],
-    pub color: &'a [[u8; 3]],
+    pub color: &'a [[u8; 4]],
     /// Columns and rows; 0 where the map is too large to be read.
     pub size: [i32; 2],
     /// Columns and rows of pixels that have others to the right and below: of the squares between four pixels.
@@ -50,18 +49,15 @@ impl<'a> Neighbour<'a> {
         let (width, height) = (map.width(), map.height());
         let size = [width, height];
         assert_rasters_match(map);
-        let is_small = width < MAX_SIDE && height < MAX_SIDE && map.depth.values().len() < MAX_PIXELS;
-        let extent = if is_small { size.map(|side| side as i32) } else { [0; 2] };
-        let next_row = if there.matrix[(1, 1)] < 0.0 { -(width as isize) } else { width as isize };
+        let extent = readable_size(size);
         Self {
             map,
             depth: map.depth.values(),
-            confidence: if is_small { map.confidence.values() } else { &[] },
-            color: if is_small { map.color.values() } else { &[] },
+            color: if extent == [0; 2] { &[] } else { map.color.values() },
             size: extent,
             squares: extent.map(|side| (side - 1).max(0)),
             touching_squares: extent.map(|side| if side > 0 { side + 1 } else { 0 }),
-            next_row,
+            next_row: there.next_row(width),
             rival: Rival::new(&map.camera, reference),
             there,
             back: Transfer::between(&map.camera, reference),
@@ -81,10 +77,16 @@ impl<'a> Neighbour<'a> {
     }
 }
 
+/// Columns and rows of a map; 0 where it is too large to be read.
+pub(crate) fn readable_size([width, height]: [usize; 2]) -> [i32; 2] {
+    let is_small = width < MAX_SIDE && height < MAX_SIDE && width * height < MAX_PIXELS;
+    if is_small { [width as i32, height as i32] } else { [0; 2] }
+}
+
 /// Makes sure of what the kernel does not check for each pixel.
 ///
 /// # Panics
-/// When the map's rasters differ in size, or a row has so many pixels that their bytes are beyond an index of 32 bits.
+/// When the map's rasters differ in size, or a row has [`MAX_PIXELS`] or more.
 pub(crate) fn assert_rasters_match(map: &DepthMap) {
     let size = [map.width(), map.height()];
     assert_eq!([map.confidence.width(), map.confidence.height()], size, "confidences of a map");
@@ -121,13 +123,14 @@ impl RowTransfer {
 
 /// From a pixel with a depth to the homogeneous pixel of another camera,
 /// `z (u, v, 1)^T = matrix (x, y, 1)^T d + vector`; z is the depth there.
-struct Transfer {
+pub(crate) struct Transfer {
     matrix: Matrix3<f64>,
     vector: Vector3<f64>,
 }
 
 impl Transfer {
-    fn between(from: &Camera, to: &Camera) -> Self {
+    /// The transfer from the pixels of one camera to those of another.
+    pub fn between(from: &Camera, to: &Camera) -> Self {
         let rotation = to.pose.rotation * from.pose.rotation.transpose();
         let k = to.intrinsics.matrix();
         Self {
@@ -136,8 +139,13 @@ impl Transfer {
         }
     }
 
+    /// From a pixel of a map `width` wide to where about it shows the next row: a row of its own, up or down.
+    pub fn next_row(&self, width: usize) -> isize {
+        if self.matrix[(1, 1)] < 0.0 { -(width as isize) } else { width as isize }
+    }
+
     /// Of row `y`, with the transfer `back`.
-    fn of_row(&self, y: usize, back: &Self) -> RowTransfer {
+    pub fn of_row(&self, y: usize, back: &Self) -> RowTransfer {
         let Self { matrix, vector } = self;
         let centre = &back.vector;
         RowTransfer {

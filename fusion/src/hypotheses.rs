@@ -1,13 +1,15 @@
 //! The depths of one row that are put to the test.
 
-use crate::kernel::LANES;
+use crate::kernel::{COUNTING, LANES, Lanes};
 
-/// Depths of neighbouring pixels that differ by less, relatively, are taken for one surface.
+/// Depths of neighbouring pixels that differ by less, relatively, are taken for one surface; of sixteen columns at once,
+/// those that differ so from the last before.
 const ONE_SURFACE: f32 = 0.02;
-/// After as many in a row that lie apart from the surface before, the next one makes a surface.
+/// After as many in a row that lie apart from the surface before, the next one makes a surface; of sixteen columns at
+/// once, when most of them do.
 const NEXT_SURFACE: usize = 3;
 /// From the first column of a block of one surface to the first that is no longer of it.
-const MAX_COLUMNS: i32 = 24;
+const MAX_COLUMNS: i32 = 28;
 
 /// One of them.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -25,50 +27,93 @@ pub(crate) struct Hypothesis {
 /// apart, outliers above all, come at the end.
 #[derive(Default)]
 pub(crate) struct HypothesisRow {
-    blocks: Vec<Block>,
-    /// The block that is not full yet, and what lies apart, till the end.
-    near: Block,
-    apart: Vec<Hypothesis>,
-    /// How many there are.
-    count: usize,
+    /// Those of surfaces, by columns, and those that lie apart from them.
+    near: List,
+    apart: List,
+    /// Where the blocks of each begin, and how many hypotheses they hold.
+    blocks: Vec<Span>,
+    /// How many of them are of those near each other.
+    blocks_near: usize,
     /// Depth of the surface that was seen last, and how many were apart from it since.
     surface: f32,
     since: usize,
 }
 
-/// As many hypotheses as the kernel takes at a time; columns of 0 and depths that are no numbers fill up the rest.
 #[derive(Clone, Copy)]
-#[repr(C, align(64))]
-pub(crate) struct Block {
-    pub columns: [i32; LANES],
-    pub depths: [f32; LANES],
+struct Span {
+    first: usize,
+    count: usize,
+}
+
+/// Hypotheses, each property for itself. Behind the last one there is memory for as many as the kernel takes at a time.
+#[derive(Default)]
+struct List {
+    columns: Vec<i32>,
+    depths: Vec<f32>,
+    own: Vec<f32>,
+    count: usize,
+}
+
+/// As many hypotheses as the kernel takes at a time. Those beyond the count are others of the row or zeros.
+#[derive(Clone, Copy)]
+pub(crate) struct Block<'a> {
+    pub columns: &'a [i32; LANES],
+    pub depths: &'a [f32; LANES],
     /// As [`Hypothesis::own`].
-    pub own: [f32; LANES],
+    pub own: &'a [f32; LANES],
     /// How many hypotheses there are.
     pub count: usize,
 }
 
-impl Default for Block {
-    fn default() -> Self {
-        Self { columns: [0; LANES], depths: [f32::NAN; LANES], own: [0.0; LANES], count: 0 }
-    }
-}
-
-impl Block {
-    /// Whether a hypothesis in that column may be added to those of one surface.
-    #[inline]
-    fn takes(&self, column: i32) -> bool {
-        self.count == 0 || self.count < LANES && column - self.columns[0] < MAX_COLUMNS
+impl List {
+    /// Empties the list, and makes room for `width` hypotheses.
+    fn clear(&mut self, width: usize) {
+        let room = width + LANES;
+        self.columns.resize(room, 0);
+        self.depths.resize(room, 0.0);
+        self.own.resize(room, 0.0);
+        self.count = 0;
     }
 
-    /// Fills the next lane; there is one.
+    /// # Panics
+    /// When there are more than the list has room for.
     #[inline]
     fn push(&mut self, Hypothesis { column, depth, own }: Hypothesis) {
-        let lane = self.count % LANES;
-        (self.columns[lane], self.depths[lane], self.own[lane]) = (column, depth, own);
+        (self.columns[self.count], self.depths[self.count], self.own[self.count]) = (column, depth, own);
         self.count += 1;
     }
 
+    /// Adds the first `count` of the lanes.
+    ///
+    /// # Panics
+    /// As [`List::push`].
+    #[inline]
+    fn extend(&mut self, columns: &[i32; LANES], depths: &[f32; LANES], count: usize) {
+        let lanes = self.count..self.count + LANES;
+        self.columns[lanes.clone()].copy_from_slice(columns);
+        self.depths[lanes.clone()].copy_from_slice(depths);
+        self.own[lanes].copy_from_slice(depths);
+        self.count += count;
+    }
+
+    /// Makes what lies behind the last one zeros.
+    fn end(&mut self) {
+        let behind = self.count..self.count + LANES;
+        self.columns[behind.clone()].fill(0);
+        self.depths[behind.clone()].fill(0.0);
+        self.own[behind].fill(0.0);
+    }
+
+    fn block(&self, Span { first, count }: Span) -> Block<'_> {
+        fn lanes<T>(values: &[T], first: usize) -> &[T; LANES] {
+            values[first..].first_chunk().expect("there is room for a block behind the last hypothesis")
+        }
+        let (columns, depths) = (lanes(&self.columns, first), lanes(&self.depths, first));
+        Block { columns, depths, own: lanes(&self.own, first), count }
+    }
+}
+
+impl Block<'_> {
     /// Whether all hypotheses lie within so many columns.
     pub fn is_within(&self, columns: i32) -> bool {
         let last = self.columns[self.count.clamp(1, LANES) - 1];
@@ -77,11 +122,12 @@ impl Block {
 }
 
 impl HypothesisRow {
-    /// Empties the row.
-    pub fn clear(&mut self) {
+    /// Empties the row, which has `width` columns.
+    pub fn clear(&mut self, width: usize) {
+        self.near.clear(width);
+        self.apart.clear(width);
         self.blocks.clear();
-        self.apart.clear();
-        (self.near, self.count) = (Block::default(), 0);
+        (self.surface, self.since) = (0.0, 0);
     }
 
     /// Adds a hypothesis in a column behind all others.
@@ -89,39 +135,79 @@ impl HypothesisRow {
     pub fn push(&mut self, hypothesis: Hypothesis) {
         let depth = hypothesis.depth;
         let is_apart = (depth - self.surface).abs() >= ONE_SURFACE * depth;
-        if is_apart && self.count > 0 && self.since < NEXT_SURFACE {
+        if is_apart && self.surface > 0.0 && self.since < NEXT_SURFACE {
             self.since += 1;
             self.apart.push(hypothesis);
         } else {
             (self.surface, self.since) = (depth, 0);
-            if !self.near.takes(hypothesis.column) {
-                self.blocks.push(std::mem::take(&mut self.near));
-            }
             self.near.push(hypothesis);
         }
-        self.count += 1;
     }
 
-    /// Ends the last block, and adds those that lie apart.
-    pub fn end(&mut self) {
-        self.blocks.extend((self.near.count > 0).then(|| std::mem::take(&mut self.near)));
-        self.blocks.extend(self.apart.chunks(LANES).map(|apart| {
-            let mut block = Block::default();
-            for hypothesis in apart {
-                block.push(*hypothesis);
+    /// Adds the reference's own depths in sixteen columns from `first` on, as far as `sure` says so, behind all others.
+    ///
+    /// # Safety
+    /// As [`Lanes`].
+    #[inline(always)]
+    #[allow(unsafe_code, clippy::inline_always, reason = "part of the kernel")]
+    pub unsafe fn push_own<L: Lanes>(&mut self, first: i32, depths: &[f32; LANES], sure: L::M) {
+        // SAFETY: the caller vouches for the processor.
+        unsafe {
+            let d = L::load(depths);
+            let columns = L::add_i(L::load_i(&COUNTING), L::splat_i(first));
+            let difference = L::abs(L::sub(d, L::splat(self.surface)));
+            let near = L::and(sure, L::less(difference, L::mul(d, L::splat(ONE_SURFACE))));
+            let apart = L::but_not(sure, near);
+            let count_near = L::bits(near).count_ones() as usize;
+            let count_apart = L::bits(apart).count_ones() as usize;
+            if count_apart <= count_near {
+                let near_depths = L::store(L::compress(near, d));
+                self.near.extend(&L::store_i(L::compress_i(near, columns)), &near_depths, count_near);
+                if count_near > 0 {
+                    self.surface = near_depths[count_near - 1];
+                }
+                if count_apart > 0 {
+                    let columns = L::store_i(L::compress_i(apart, columns));
+                    self.apart.extend(&columns, &L::store(L::compress(apart, d)), count_apart);
+                }
+            } else {
+                // Another surface begins, or none is there.
+                let sure = L::bits(sure);
+                for k in (0..LANES).filter(|k| sure >> k & 1 == 1) {
+                    self.push(Hypothesis { column: first + k as i32, depth: depths[k], own: depths[k] });
+                }
             }
-            block
-        }));
+            self.since = 0;
+        }
     }
 
-    /// How many hypotheses there are.
+    /// Divides the hypotheses into blocks.
+    pub fn end(&mut self) {
+        self.near.end();
+        self.apart.end();
+        let mut first = 0;
+        while first < self.near.count {
+            let most = LANES.min(self.near.count - first);
+            let columns = &self.near.columns[first..first + most];
+            let count = columns.partition_point(|column| *column - columns[0] < MAX_COLUMNS);
+            self.blocks.push(Span { first, count });
+            first += count;
+        }
+        self.blocks_near = self.blocks.len();
+        let apart = self.apart.count;
+        self.blocks
+            .extend((0..apart).step_by(LANES).map(|first| Span { first, count: LANES.min(apart - first) }));
+    }
+
+    /// How many there are.
     pub fn len(&self) -> usize {
-        self.count
+        self.near.count + self.apart.count
     }
 
     /// All of them, after [`HypothesisRow::end`].
-    pub fn blocks(&self) -> &[Block] {
-        &self.blocks
+    pub fn blocks(&self) -> impl Iterator<Item = Block<'_>> {
+        let (near, apart) = self.blocks.split_at(self.blocks_near);
+        near.iter().map(|span| self.near.block(*span)).chain(apart.iter().map(|span| self.apart.block(*span)))
     }
 }
 
@@ -131,12 +217,13 @@ mod tests {
 
     fn row(hypotheses: &[(i32, f32)]) -> HypothesisRow {
         let mut row = HypothesisRow::default();
+        row.clear(100);
         // What was in it before plays no part.
         for depth in [7.0, 70.0] {
             row.push(Hypothesis { column: 0, depth, own: 0.0 });
         }
         row.end();
-        row.clear();
+        row.clear(100);
         for (column, depth) in hypotheses.iter().copied() {
             row.push(Hypothesis { column, depth, own: -depth });
         }
@@ -146,12 +233,11 @@ mod tests {
 
     /// Columns and depths of each block.
     fn blocks(row: &HypothesisRow) -> Vec<Vec<(i32, f32)>> {
-        let lanes = |block: &Block| {
+        let lanes = |block: &Block<'_>| -> Vec<(i32, f32)> {
             assert!(block.own.iter().zip(block.depths).take(block.count).all(|(own, depth)| *own == -depth));
-            assert!(block.depths[block.count..].iter().all(|depth| depth.is_nan()));
-            block.columns.into_iter().zip(block.depths).take(block.count).collect()
+            block.columns.iter().copied().zip(block.depths.iter().copied()).take(block.count).collect()
         };
-        row.blocks().iter().map(lanes).collect()
+        row.blocks().map(|block| lanes(&block)).collect()
     }
 
     #[test]
@@ -172,8 +258,8 @@ mod tests {
     #[test]
     fn blocks_are_full_unless_their_columns_are_far_apart() {
         let row = row(&(0..40).map(|x| (if x < 20 { x } else { x + 30 }, 3.0)).collect::<Vec<_>>());
-        let counts: Vec<_> = row.blocks().iter().map(|block| block.count).collect();
+        let counts: Vec<_> = row.blocks().map(|block| block.count).collect();
         assert_eq!(counts, [16, 4, 16, 4]);
-        assert!(self::row(&[]).blocks().is_empty());
+        assert_eq!(self::row(&[]).blocks().count(), 0);
     }
 }

@@ -10,7 +10,7 @@ use crate::{BlobKey, JobId};
 
 /// Raised whenever a change of the code changes the numbers of a result, so that results of older
 /// code are not taken for those of newer code.
-pub const NUMERICS_VERSION: u32 = 3;
+pub const NUMERICS_VERSION: u32 = 4;
 
 /// One unit of work.
 #[derive(Clone, Debug, PartialEq)]

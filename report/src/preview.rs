@@ -86,7 +86,7 @@ pub fn draw_preview(
     for y in 0..panel_height {
         for x in 0..panel_width {
             let (u, v) = (zoom.source(x), zoom.source(y));
-            let color = map.color.at(u, v);
+            let color = map.rgb(u, v);
             let pixels = [
                 color,
                 scale.color(map.depth.at(u, v)).unwrap_or(NOTHING),

@@ -273,11 +273,11 @@ mod tests {
         let quarter = read(16, 9);
         let k = quarter.camera.intrinsics;
         assert_eq!((k.width, k.height, k.fx, k.cx, k.cy), (16, 9, 15.0, 31.5 / 4.0, 23.5 / 4.0));
-        assert_eq!(quarter.color.at(5, 3), [80, 60, 9]);
+        assert_eq!(quarter.rgb(5, 3), [80, 60, 9]);
         let same = read(64, 48);
-        assert_eq!((same.camera, same.color.at(5, 3)), (view.camera, [20, 15, 9]));
+        assert_eq!((same.camera, same.rgb(5, 3)), (view.camera, [20, 15, 9]));
         let half = read(32, 24);
-        assert_eq!((half.camera.intrinsics.cx, half.color.at(5, 3)), (31.5 / 2.0, [40, 30, 9]));
+        assert_eq!((half.camera.intrinsics.cx, half.rgb(5, 3)), (31.5 / 2.0, [40, 30, 9]));
         let resized = read(200, 150).camera.intrinsics;
         assert_eq!((resized.fx, resized.cx), (187.5, 32.0 * 3.125 - 0.5));
     }

@@ -13,8 +13,10 @@ pub struct DepthMap {
     pub depth: Raster<f32>,
     /// Confidence in `[0, 1]`.
     pub confidence: Raster<f32>,
-    /// Colour of the reference image at each pixel of the depth map.
-    pub color: Raster<[u8; 3]>,
+    /// Red, green and blue of the reference image at each pixel of the depth map, and the confidence once more, in
+    /// 255ths: a word for each pixel of what fusion asks a neighbour for beside its depth. Who changes one confidence changes the
+    /// other ([`in_255ths`]).
+    pub color: Raster<[u8; 4]>,
 }
 
 /// Why parts do not make a depth map.
@@ -63,6 +65,7 @@ impl DepthMap {
         for c in confidence.values_mut() {
             *c = if c.is_nan() { 0.0 } else { c.clamp(0.0, 1.0) };
         }
+        let color = with_confidence(&color, &confidence);
         Ok(Self { camera, depth, confidence, color })
     }
 
@@ -78,6 +81,15 @@ impl DepthMap {
         }
     }
 
+    /// Red, green and blue of a pixel.
+    ///
+    /// # Panics
+    /// When outside the map.
+    pub fn rgb(&self, x: usize, y: usize) -> [u8; 3] {
+        let [r, g, b, _] = self.color.at(x, y);
+        [r, g, b]
+    }
+
     /// Columns.
     pub fn width(&self) -> usize {
         self.depth.width()
@@ -87,6 +99,19 @@ impl DepthMap {
     pub fn height(&self) -> usize {
         self.depth.height()
     }
+}
+
+/// Colours, and beside each the confidence in 255ths.
+pub(crate) fn with_confidence(color: &Raster<[u8; 3]>, confidence: &Raster<f32>) -> Raster<[u8; 4]> {
+    let words = color.values().iter().zip(confidence.values());
+    let words = words.map(|(&[r, g, b], confidence)| [r, g, b, in_255ths(*confidence)]);
+    Raster::new(color.width(), color.height(), words.collect()).expect("the colours had that size")
+}
+
+/// A confidence as the fourth byte of [`DepthMap::color`], rounded: what is less is never more there, what lies outside
+/// of [0, 1] becomes the nearer end, and what is no number 0.
+pub fn in_255ths(confidence: f32) -> u8 {
+    (confidence * 255.0 + 0.5) as u8
 }
 
 #[cfg(test)]
@@ -109,6 +134,7 @@ mod tests {
             DepthMap::new(camera(), depth, confidence, Raster::filled(2, 2, [0; 3])).expect("sizes agree");
         assert_eq!(map.depth.values(), [0.0, 0.0, 0.0, 2.0]);
         assert_eq!(map.confidence.values(), [0.0, 0.0, 1.0, 0.5]);
+        assert_eq!(map.color.values(), [[0; 4], [0; 4], [0, 0, 0, 255], [0, 0, 0, 128]]);
     }
 
     #[test]

@@ -37,7 +37,7 @@ mod write;
 
 pub use camera::{Camera, CameraError, Intrinsics, Pose};
 pub use depth_files::{DepthFiles, DepthFilesError, MapGeometry, find_depth_files, find_mask};
-pub use depth_map::{DepthMap, DepthMapError};
+pub use depth_map::{DepthMap, DepthMapError, in_255ths};
 pub use distortion::Distortion;
 pub use hypotheses::{DepthHypotheses, HypothesesError, Sampling};
 pub use ids::ViewId;

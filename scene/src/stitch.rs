@@ -105,7 +105,7 @@ mod tests {
             camera: Camera { intrinsics, pose },
             depth: Raster::from_fn(width, height, value),
             confidence: Raster::from_fn(width, height, |x, y| 1.0 / value(x, y)),
-            color: Raster::from_fn(width, height, |x, y| [x as u8, y as u8, 7]),
+            color: Raster::from_fn(width, height, |x, y| [x as u8, y as u8, 7, 204]),
         }
     }
 

@@ -2,6 +2,7 @@
 
 use rayon::prelude::*;
 
+use crate::depth_map::with_confidence;
 use crate::{Camera, DepthMap, Raster, WorkingImage};
 
 /// Two depths that differ by less, relatively, from one pixel of a map to the next are one surface: a plane seen at 80
@@ -37,7 +38,8 @@ impl DepthMap {
             },
         );
         let camera = Camera { intrinsics: *k, pose: self.camera.pose };
-        DepthMap { camera, depth, confidence, color: image.pixels.clone() }
+        let color = with_confidence(&image.pixels, &confidence);
+        DepthMap { camera, depth, confidence, color }
     }
 }
 
@@ -107,7 +109,7 @@ impl Guided<'_> {
                 if seen == 0.0 {
                     continue;
                 }
-                let there = self.map.color.at(column, row);
+                let there = self.map.rgb(column, row);
                 let square = |a: u8, b: u8| (f32::from(a) - f32::from(b)).powi(2);
                 let difference: f32 = color.iter().zip(there).map(|(a, b)| square(*a, b)).sum();
                 let distance = (column as f32 - u).powi(2) + (row as f32 - v).powi(2);

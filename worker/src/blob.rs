@@ -49,7 +49,7 @@ pub fn encode_depth_map(map: &DepthMap, out: &mut dyn BufMut) {
     put_header(out, DEPTH_MAP, &map.camera);
     put_floats(out, map.depth.values());
     put_floats(out, map.confidence.values());
-    out.put_slice(map.color.values().as_flattened());
+    put_colors(out, map.color.values());
 }
 
 /// How many bytes a depth map has.
@@ -117,6 +117,17 @@ fn put_floats(out: &mut dyn BufMut, values: &[f32]) {
             *bytes = value.to_le_bytes();
         }
         out.put_slice(piece[..values.len()].as_flattened());
+    }
+}
+
+/// The colours alone: confidences are there as floats.
+fn put_colors(out: &mut dyn BufMut, colors: &[[u8; 4]]) {
+    let mut piece = [[0; 3]; 1024];
+    for colors in colors.chunks(piece.len()) {
+        for (bytes, [r, g, b, _]) in piece.iter_mut().zip(colors) {
+            *bytes = [*r, *g, *b];
+        }
+        out.put_slice(piece[..colors.len()].as_flattened());
     }
 }
 

@@ -17,7 +17,7 @@ pub(crate) struct ByPixels;
 
 impl Weighter<BlobKey, Arc<DepthMap>> for ByPixels {
     fn weight(&self, _: &BlobKey, map: &Arc<DepthMap>) -> u64 {
-        map.depth.values().len() as u64 * 11
+        map.depth.values().len() as u64 * 12
     }
 }
 

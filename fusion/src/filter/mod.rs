@@ -1,5 +1,7 @@
 //! One reference view against its neighbours: both criteria, and the mean over the views that agree.
 
+mod unwritten;
+
 use planesweep_scene::{Camera, DepthMap, Raster};
 use rayon::prelude::*;
 
@@ -10,6 +12,7 @@ use crate::kernel::{self, Input, Level, OutputRow, filter_row};
 use crate::options::{FilterOptions, FusionMethod};
 use crate::photometric::confident_depths;
 use crate::visibility::{self, Candidates};
+use unwritten::Unwritten;
 
 /// Neighbours whose agreement [`FilteredMap::agreeing`] can record.
 pub const MAX_RECORDED: usize = u64::BITS as usize;
@@ -21,18 +24,16 @@ pub struct FilteredMap {
     pub camera: Camera,
     /// Mean depth of the views that agree (z, scene units); 0 where the pixel was dropped.
     pub depth: Raster<f32>,
-    /// Mean colour of the views that agree; black where the pixel was dropped.
-    pub color: Raster<[u8; 3]>,
+    /// Mean red, green, blue and, in 255ths, confidence of the views that agree; zeros where the pixel was dropped.
+    pub color: Raster<[u8; 4]>,
     /// How many views agree, the reference included, 255 meaning that or more; counted for dropped
     /// pixels too, 0 where there is nothing to agree with.
     pub views: Raster<u8>,
-    /// Mean confidence of the views that agree, in 255ths; 0 where the pixel was dropped.
-    pub confidence: Raster<u8>,
     /// Which neighbours agree: bit k is the one at index k, as far as there are bits; 0 where the
     /// pixel was dropped.
     pub agreeing: Raster<u64>,
-    /// Whether the pixel owns its surface: no confident view that agrees sees it with a smaller
-    /// footprint. False where the pixel was dropped.
+    /// Whether the pixel owns its surface: no view that agrees and is confident, in 255ths, sees it with a
+    /// smaller footprint. False where the pixel was dropped.
     pub owns: Raster<bool>,
     /// How many pixels each step left; `emitted` is 0 yet.
     pub funnel: Funnel,
@@ -73,36 +74,39 @@ fn filter_with(
     let candidates = match options.method {
         FusionMethod::Consistency | FusionMethod::Dynamic => None,
         FusionMethod::Visibility | FusionMethod::VisibilityConfidence => {
-            Some(Candidates::new(reference, &neighbours, options))
+            Some(Candidates::new(reference, &neighbours, options, level))
         }
     };
     let input = Input { reference, neighbours: &neighbours, options, level };
-    let mut depth = Raster::filled(width, height, 0.0);
-    let mut color = Raster::filled(width, height, [0; 3]);
-    let mut views = Raster::filled(width, height, 0);
-    let mut confidence = Raster::filled(width, height, 0);
-    let mut agreeing = Raster::filled(width, height, 0);
-    let mut owns = Raster::filled(width, height, false);
-    let columns = width.max(1); // a chunk of an empty map
-    let rows = depth
-        .values_mut()
-        .par_chunks_exact_mut(columns)
-        .zip(color.values_mut().par_chunks_exact_mut(columns))
-        .zip(views.values_mut().par_chunks_exact_mut(columns))
-        .zip(confidence.values_mut().par_chunks_exact_mut(columns))
-        .zip(agreeing.values_mut().par_chunks_exact_mut(columns))
-        .zip(owns.values_mut().par_chunks_exact_mut(columns));
+    let mut depth = Unwritten::new(width, height);
+    let mut color = Unwritten::new(width, height);
+    let mut views = Unwritten::new(width, height);
+    let mut agreeing = Unwritten::new(width, height);
+    let mut owns = Unwritten::new(width, height);
+    let rows = depth.rows().zip(color.rows()).zip(views.rows()).zip(agreeing.rows()).zip(owns.rows());
     let funnel = rows
         .enumerate()
-        .map_init(
-            RowFilter::default,
-            |row, (y, (((((depth, color), views), confidence), agreeing), owns))| {
-                let mut out = OutputRow { depth, color, views, confidence, agreeing, owns };
-                row.run(&input, candidates.as_ref(), y, &mut out)
-            },
-        )
+        .map_init(RowFilter::default, |row, (y, ((((depth, color), views), agreeing), owns))| {
+            let mut out = OutputRow { depth, color, views, agreeing, owns };
+            row.run(&input, candidates.as_ref(), y, &mut out)
+        })
         .sum();
-    FilteredMap { camera: reference.camera, depth, color, views, confidence, agreeing, owns, funnel }
+    // SAFETY: the loop took every row of each.
+    #[allow(
+        unsafe_code,
+        reason = "clearing all of the result first, on one thread, would take a tenth of the time"
+    )]
+    unsafe {
+        FilteredMap {
+            camera: reference.camera,
+            depth: depth.written(),
+            color: color.written(),
+            views: views.written(),
+            agreeing: agreeing.written(),
+            owns: owns.written(),
+            funnel,
+        }
+    }
 }
 
 /// The filter of one row, with the memory it uses again for the next.
@@ -122,12 +126,13 @@ impl RowFilter {
         y: usize,
         out: &mut OutputRow<'_>,
     ) -> Funnel {
-        let Input { reference, options, .. } = *input;
+        let Input { reference, options, level, .. } = *input;
         let (with_depth, photometric) = if let Some(candidates) = candidates {
             let counts = candidates.choose(y, &mut self.visibility, &mut self.hypotheses);
             (counts.with_depth, counts.photometric)
         } else {
-            let with_depth = confident_depths(reference, y, options.min_confidence, &mut self.hypotheses);
+            let with_depth =
+                confident_depths(level, reference, y, options.min_confidence, &mut self.hypotheses);
             (with_depth, self.hypotheses.len())
         };
         let geometric = filter_row(input, y, &self.hypotheses, &mut self.kernel, out);

@@ -3,8 +3,9 @@ use planesweep_scene::Pose;
 use proptest::prelude::*;
 
 use super::*;
-use crate::analytic::{Surface, camera_at};
+use crate::analytic::{Surface, camera_at, set_confidence};
 use crate::options::DepthSampling;
+use crate::surface::emitted_with;
 
 const PLANE: Surface = Surface::Plane { slope: 0.2 };
 const METHODS: [FusionMethod; 4] = [
@@ -82,7 +83,7 @@ fn wrong_depths_are_dropped_where_they_are_and_harmless_elsewhere() {
     let filtered = filter_first(&maps, &FilterOptions::default());
     for (x, y) in pixels(&maps[0]) {
         if block(x, y) {
-            assert_eq!((filtered.depth.at(x, y), filtered.color.at(x, y)), (0.0, [0; 3]));
+            assert_eq!((filtered.depth.at(x, y), filtered.color.at(x, y)), (0.0, [0; 4]));
         } else if (14..46).contains(&x) && (12..32).contains(&y) {
             assert_eq!(good.views.at(x, y), 5);
             assert_eq!(filtered.views.at(x, y), 4);
@@ -151,14 +152,15 @@ fn continuous_sampling_confirms_beside_holes() {
 /// A noisy map of the plane with holes, doubtful pixels and depths of no surface.
 fn noisy_map(camera: Camera, noise: &[(f32, f32)]) -> DepthMap {
     let mut map = PLANE.map(camera);
-    let both = map.depth.values_mut().iter_mut().zip(map.confidence.values_mut());
-    for ((depth, confidence), (step, sure)) in both.zip(noise.iter().cycle()) {
+    let width = map.width();
+    for (index, (step, sure)) in (0..map.depth.values().len()).zip(noise.iter().cycle()) {
+        set_confidence(&mut map, index % width, index / width, *sure);
+        let depth = &mut map.depth.values_mut()[index];
         *depth *= match *step {
             s if s < -0.9 => 0.0,
             s if s > 0.9 => 3.0,
             s => 1.0 + 0.012 * s,
         };
-        *confidence = *sure;
     }
     map
 }
@@ -178,8 +180,7 @@ prop_compose! {
 /// What a view that agrees has for a hypothesis.
 struct Agreeing {
     depth: f64,
-    color: [u8; 3],
-    confidence: f64,
+    color: [u8; 4],
 }
 
 /// The criterion in `f64`, word for word: the views that agree, by index; `None` when a threshold is so close that
@@ -192,11 +193,7 @@ fn agreeing(
 ) -> Option<Vec<(usize, Agreeing)>> {
     let d = maps[0].depth.at(x, y) as f64;
     let p = Point2::new(x as f64, y as f64);
-    let of = |map: &DepthMap, depth: f64, x: usize, y: usize| Agreeing {
-        depth,
-        color: map.color.at(x, y),
-        confidence: map.confidence.at(x, y) as f64,
-    };
+    let of = |map: &DepthMap, depth: f64, x: usize, y: usize| Agreeing { depth, color: map.color.at(x, y) };
     let mut views = vec![(0, of(&maps[0], d, x, y))];
     for (index, map) in maps.iter().enumerate().skip(1) {
         let Some((q, _)) = map.camera.project(&maps[0].camera.unproject(&p, d)) else { continue };
@@ -253,7 +250,7 @@ proptest! {
             prop_assert_eq!(filtered.views.at(x, y) as usize, views.len());
             let depth = filtered.depth.at(x, y) as f64;
             if views.len() < min_views as usize {
-                prop_assert_eq!((depth, filtered.color.at(x, y), filtered.agreeing.at(x, y)), (0.0, [0; 3], 0));
+                prop_assert_eq!((depth, filtered.color.at(x, y), filtered.agreeing.at(x, y)), (0.0, [0; 4], 0));
                 continue;
             }
             let mean = |of: &dyn Fn(&Agreeing) -> f64| {
@@ -268,8 +265,6 @@ proptest! {
                 let mean = mean(&|view| view.color[channel].into());
                 prop_assert!((value as f64 - mean).abs() <= 0.501, "{} for {}", value, mean);
             }
-            let confidence = 255.0 * mean(&|view| view.confidence);
-            prop_assert!((filtered.confidence.at(x, y) as f64 - confidence).abs() <= 0.501);
             let agreeing = views.iter().skip(1).fold(0, |bits, (index, _)| bits | 1 << (index - 1));
             prop_assert_eq!(filtered.agreeing.at(x, y), agreeing);
         }
@@ -321,6 +316,13 @@ proptest! {
         let (first, second) = (map(&numbers[..18]), map(&numbers[18..]));
         let sampling = if continuous { DepthSampling::Continuous } else { DepthSampling::Bilinear };
         let options = FilterOptions { method, min_views: 1, sampling, ..FilterOptions::default() };
+        let options_of_one = FilterOptions { min_views: 1, ..FilterOptions::default() };
+        let alone = [&first, &second, &sane].map(|map| filter(map, &[], &options_of_one));
+        let emissions = Level::available().into_iter().map(|level| {
+            [0, 2].map(|map| emitted_with(level, &alone[map], &[&alone[1], &alone[2 - map]], 0.01))
+        });
+        let emissions: Vec<_> = emissions.collect();
+        prop_assert!(emissions.iter().all(|emitted| *emitted == emissions[0]));
         for (reference, neighbours) in [(&first, [&second, &sane]), (&sane, [&first, &second])] {
             let filtered = filter(reference, &neighbours, &options);
             prop_assert!(filtered.depth.values().iter().all(|d| d.is_finite() && *d >= 0.0));
@@ -328,8 +330,8 @@ proptest! {
                 let other = filter_with(level, reference, &neighbours, &options);
                 // Not the cameras, which may not equal themselves.
                 prop_assert!(other.depth == filtered.depth && other.color == filtered.color, "{:?}", level);
-                prop_assert!(other.confidence == filtered.confidence && other.owns == filtered.owns);
-                prop_assert!(other.views == filtered.views && other.agreeing == filtered.agreeing);
+                prop_assert!(other.owns == filtered.owns && other.views == filtered.views);
+                prop_assert!(other.agreeing == filtered.agreeing);
             }
         }
     }
@@ -362,7 +364,7 @@ fn wider_registers_change_no_bit() {
     let empty = maps.last_mut().expect("it was pushed");
     empty.depth = Raster::filled(0, 0, 0.0);
     empty.confidence = Raster::filled(0, 0, 0.0);
-    empty.color = Raster::filled(0, 0, [0; 3]);
+    empty.color = Raster::filled(0, 0, [0; 4]);
     maps.extend([(1, 1), (1, 9), (9, 1)].map(|(w, h)| noisy_map(camera_at(0.2, 0.1, w, h), &noise)));
     // Rolled, so that rows of the reference lie across theirs in every way.
     maps.extend([0.05, 0.2, 1.6, 3.1, 4.7].map(|roll| {
@@ -413,6 +415,6 @@ fn maps_about_as_large_as_a_window_change_no_bit() {
 #[should_panic(expected = "colours of a map")]
 fn a_reference_with_rasters_of_two_sizes_is_refused() {
     let mut map = PLANE.map(camera_at(0.0, 0.0, 40, 8));
-    map.color = Raster::filled(0, 8, [0; 3]);
+    map.color = Raster::filled(0, 8, [0; 4]);
     filter(&map, &[], &FilterOptions { min_views: 1, ..FilterOptions::default() });
 }

@@ -109,10 +109,12 @@ pub(super) unsafe fn project<L: Lanes>(
     (place.fx, place.fy) = (L::store(fx), L::store(fy));
 }
 
-/// Has the processor fetch the rows of a neighbour that the next rows of the reference will ask for, beyond `place`.
+/// Has the processor fetch the rows of a neighbour that the next rows of the reference will ask for, about `place`: the
+/// columns of a window, wherever lines of the cache begin.
 ///
-/// It does not foresee that by itself for all rasters of all neighbours. Confidences and colours are fetched two rows
-/// ahead, depths a row more, for they are read of the row below, too.
+/// It does not foresee that by itself for all rasters of all neighbours. Colours are fetched three rows ahead, depths
+/// four, for they are read of the row below, too: where rows are slanted, or denser than those of the reference, two
+/// were not enough.
 ///
 /// # Safety
 /// As [`Lanes`].
@@ -122,10 +124,9 @@ pub(super) unsafe fn fetch_ahead<L: Lanes>(neighbour: &Neighbour<'_>, place: &Pl
         return;
     }
     let first = place.row[0] as isize * neighbour.size[0] as isize + place.column[0] as isize;
-    let band = first + 2 * neighbour.next_row;
-    for ahead in [band, band + LANES as isize] {
+    let band = first - LANES as isize / 2 + 3 * neighbour.next_row;
+    for ahead in [band, band + LANES as isize, band + 2 * LANES as isize] {
         L::prefetch(neighbour.depth.as_ptr().wrapping_offset(ahead + neighbour.next_row));
-        L::prefetch(neighbour.confidence.as_ptr().wrapping_offset(ahead));
         L::prefetch(neighbour.color.as_ptr().wrapping_offset(ahead));
     }
 }
@@ -190,7 +191,7 @@ pub(super) unsafe fn compare<L: Lanes>(
 
 /// A coordinate of the homogeneous pixel in the neighbour.
 #[inline(always)]
-unsafe fn transferred<L: Lanes>(transfer: &RowTransfer, axis: usize, x: L::F, d: L::F) -> L::F {
+pub(crate) unsafe fn transferred<L: Lanes>(transfer: &RowTransfer, axis: usize, x: L::F, d: L::F) -> L::F {
     let RowTransfer { along, start, shift, .. } = transfer;
     let at_depth_1 = L::mul_add(x, L::splat(along[axis]), L::splat(start[axis]));
     L::mul_add(at_depth_1, d, L::splat(shift[axis]))

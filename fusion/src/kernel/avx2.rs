@@ -186,8 +186,8 @@ impl Lanes for Avx2 {
         [_mm256_i32gather_ps::<4>(from, at[0]), _mm256_i32gather_ps::<4>(from, at[1])]
     }
     #[inline(always)]
-    unsafe fn gather_bytes(from: *const u8, at: Self::I) -> Self::I {
-        [_mm256_i32gather_epi32::<1>(from.cast(), at[0]), _mm256_i32gather_epi32::<1>(from.cast(), at[1])]
+    unsafe fn gather_words(from: *const [u8; 4], at: Self::I) -> Self::I {
+        [_mm256_i32gather_epi32::<4>(from.cast(), at[0]), _mm256_i32gather_epi32::<4>(from.cast(), at[1])]
     }
     #[inline(always)]
     unsafe fn prefetch<T>(place: *const T) {

@@ -10,7 +10,7 @@ use super::lanes::{LANES, Lanes};
 pub(crate) struct Avx512;
 
 /// # Safety
-/// The processor has AVX-512 F, BW, DQ, VL and VBMI.
+/// The processor has AVX-512 F, BW, DQ and VL.
 impl Lanes for Avx512 {
     type F = __m512;
     type I = __m512i;
@@ -165,6 +165,15 @@ impl Lanes for Avx512 {
         _mm512_mask_blend_epi32(m, b, a)
     }
 
+    #[inline(always)]
+    unsafe fn compress(m: __mmask16, v: __m512) -> __m512 {
+        _mm512_maskz_compress_ps(m, v)
+    }
+    #[inline(always)]
+    unsafe fn compress_i(m: __mmask16, v: __m512i) -> __m512i {
+        _mm512_maskz_compress_epi32(m, v)
+    }
+
     const PICKS: bool = true;
     #[inline(always)]
     unsafe fn pick(window: *const f32, at: __m512i) -> __m512 {
@@ -172,16 +181,9 @@ impl Lanes for Avx512 {
         _mm512_permutex2var_ps(first, at, second)
     }
     #[inline(always)]
-    unsafe fn pick_color(window: *const [u8; 3], at: __m512i) -> __m512i {
-        // Of 96 bytes the first 64 and the last 64; colour 16 and those behind it are taken from the latter.
-        let bytes = window.cast::<u8>();
-        let (first, second) = (_mm512_loadu_si512(bytes.cast()), _mm512_loadu_si512(bytes.add(32).cast()));
-        let late = _mm512_slli_epi32::<1>(_mm512_and_si512(at, _mm512_set1_epi32(16)));
-        let at = _mm512_and_si512(at, _mm512_set1_epi32(31));
-        let red = _mm512_add_epi32(late, _mm512_add_epi32(at, _mm512_slli_epi32::<1>(at)));
-        let each = _mm512_or_si512(red, _mm512_slli_epi32::<8>(red));
-        let each = _mm512_or_si512(each, _mm512_slli_epi32::<16>(red));
-        _mm512_permutex2var_epi8(first, _mm512_add_epi32(each, _mm512_set1_epi32(0x0002_0100)), second)
+    unsafe fn pick_words(window: *const [u8; 4], at: __m512i) -> __m512i {
+        let (first, second) = (window.cast(), window.add(LANES).cast());
+        _mm512_permutex2var_epi32(_mm512_loadu_si512(first), at, _mm512_loadu_si512(second))
     }
     #[inline(always)]
     unsafe fn pairs(from: *const f32, at: __m512i) -> (__m512, __m512) {
@@ -197,8 +199,8 @@ impl Lanes for Avx512 {
         _mm512_i32gather_ps::<4>(at, from)
     }
     #[inline(always)]
-    unsafe fn gather_bytes(from: *const u8, at: __m512i) -> __m512i {
-        _mm512_i32gather_epi32::<1>(at, from.cast())
+    unsafe fn gather_words(from: *const [u8; 4], at: __m512i) -> __m512i {
+        _mm512_i32gather_epi32::<4>(at, from.cast())
     }
     #[inline(always)]
     unsafe fn prefetch<T>(place: *const T) {

@@ -9,6 +9,9 @@ pub(crate) const LANES: usize = 16;
 /// Columns of a window that values are picked from.
 pub(crate) const WINDOW_COLUMNS: i32 = 32;
 
+/// The lanes' numbers.
+pub(crate) const COUNTING: [i32; LANES] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15];
+
 /// Operations on sixteen lanes.
 ///
 /// # Safety
@@ -72,6 +75,19 @@ pub(crate) trait Lanes {
     /// `a` where `m` says so, else `b`.
     unsafe fn select_i(m: Self::M, a: Self::I, b: Self::I) -> Self::I;
 
+    /// The lanes that `m` names come first, in their order; behind them lies anything.
+    #[inline(always)]
+    unsafe fn compress(m: Self::M, v: Self::F) -> Self::F {
+        // SAFETY: the caller vouches for the processor.
+        unsafe { Self::load(&compressed(Self::bits(m), Self::store(v))) }
+    }
+    /// The same of integers.
+    #[inline(always)]
+    unsafe fn compress_i(m: Self::M, v: Self::I) -> Self::I {
+        // SAFETY: as above.
+        unsafe { Self::load_i(&compressed(Self::bits(m), Self::store_i(v))) }
+    }
+
     /// The values at `at` from `from` on, and those behind them.
     #[inline(always)]
     unsafe fn pairs(from: *const f32, at: Self::I) -> (Self::F, Self::F) {
@@ -87,17 +103,17 @@ pub(crate) trait Lanes {
             Self::load(&values)
         }
     }
-    /// The four bytes each, the lowest first, at `at` from `from` on.
+    /// The words at `at` from `from` on, the lowest byte first.
     #[inline(always)]
-    unsafe fn gather_bytes(from: *const u8, at: Self::I) -> Self::I {
+    unsafe fn gather_words(from: *const [u8; 4], at: Self::I) -> Self::I {
         // SAFETY: as above.
         unsafe {
-            let bytes = Self::store_i(at).map(|at| from.add(at as usize).cast::<[u8; 4]>().read());
-            Self::load_i(&bytes.map(i32::from_le_bytes))
+            let words = Self::store_i(at).map(|at| from.add(at as usize).read());
+            Self::load_i(&words.map(i32::from_le_bytes))
         }
     }
 
-    /// Whether [`Lanes::pick`] and [`Lanes::pick_color`] are faster than a copy for each lane.
+    /// Whether [`Lanes::pick`] and [`Lanes::pick_words`] are faster than a copy for each lane.
     const PICKS: bool = false;
     /// Values of the [`WINDOW_COLUMNS`] that can be read from `window` on: in each lane the one at `at`, modulo their
     /// number.
@@ -112,15 +128,14 @@ pub(crate) trait Lanes {
             Self::load(&picked)
         }
     }
-    /// The same of colours; the fourth byte of each is any.
+    /// The same of words, the lowest byte first.
     #[inline(always)]
-    unsafe fn pick_color(window: *const [u8; 3], at: Self::I) -> Self::I {
+    unsafe fn pick_words(window: *const [u8; 4], at: Self::I) -> Self::I {
         // SAFETY: as above.
         unsafe {
             let mut picked = [0; LANES];
-            for (color, at) in picked.iter_mut().zip(Self::store_i(at)) {
-                let [r, g, b] = window.add(at.rem_euclid(WINDOW_COLUMNS) as usize).read();
-                *color = i32::from_le_bytes([r, g, b, 0]);
+            for (word, at) in picked.iter_mut().zip(Self::store_i(at)) {
+                *word = i32::from_le_bytes(window.add(at.rem_euclid(WINDOW_COLUMNS) as usize).read());
             }
             Self::load_i(&picked)
         }
@@ -128,6 +143,17 @@ pub(crate) trait Lanes {
 
     /// Has the processor fetch a place, if it is one, into its second cache.
     unsafe fn prefetch<T>(place: *const T);
+}
+
+/// The values whose bits are set, at the front.
+#[inline(always)]
+fn compressed<T: Copy>(bits: u32, mut values: [T; LANES]) -> [T; LANES] {
+    let mut count = 0;
+    for k in 0..LANES {
+        values[count] = values[k];
+        count += (bits >> k & 1) as usize;
+    }
+    values
 }
 
 /// Arrays, for every processor.
@@ -299,31 +325,35 @@ mod tests {
     use super::*;
 
     /// What comes out of the operations that the levels implement in ways of their own.
-    fn outcomes<L: Lanes>(at: [i32; LANES], floats: [f32; LANES]) -> [[i32; LANES]; 12] {
+    fn outcomes<L: Lanes>(at: [i32; LANES], floats: [f32; LANES]) -> [[i32; LANES]; 13] {
         let values: Vec<f32> = (0..200).map(|i| i as f32 + 0.5).collect();
-        let colors: Vec<[u8; 3]> = (0..64).map(|i| [i, 64 + i, 128 + i]).collect();
-        let bytes = colors.as_flattened();
+        let words: Vec<[u8; 4]> = (0..200).map(|i| [i, 64 + i % 64, 128 + i % 64, 255 - i]).collect();
         let inside = at.map(|at| at.rem_euclid(150));
         let as_bits = |v: L::F| unsafe { L::store(v) }.map(|v: f32| v.to_bits() as i32);
         let as_numbers = |m: L::M| unsafe { L::store_i(L::only_i(m, L::splat_i(1))) };
-        // SAFETY: the caller asked the processor; 200 values, 64 colours and 192 bytes are there.
+        // SAFETY: the caller asked the processor; 200 values and as many words are there.
         unsafe {
             let (lanes, inside) = (L::load_i(&at), L::load_i(&inside));
             let (first, second) = L::pairs(values.as_ptr(), inside);
-            let color = L::pick_color(colors.as_ptr(), lanes);
+            // Some lanes, none, and all; what lies behind them may be anything.
+            let some = L::below(lanes, 30);
+            let front = L::below(L::load_i(&COUNTING), L::bits(some).count_ones() as i32);
+            let compressed =
+                L::add_i(L::compress_i(some, lanes), L::truncate(L::compress(some, L::to_float(lanes))));
             [
                 as_bits(L::pick(values.as_ptr(), lanes)),
-                L::store_i(L::and_i(color, L::splat_i(0x00FF_FFFF))),
+                L::store_i(L::pick_words(words.as_ptr(), lanes)),
                 as_bits(first),
                 as_bits(second),
                 as_bits(L::gather(values.as_ptr(), inside)),
-                L::store_i(L::gather_bytes(bytes.as_ptr(), inside)),
+                L::store_i(L::gather_words(words.as_ptr(), inside)),
                 as_numbers(L::below(lanes, 0)),
                 as_numbers(L::below(lanes, 7)),
                 as_numbers(L::below(lanes, i32::MAX)),
                 as_numbers(L::equal(lanes, L::splat_i(3))),
                 L::store_i(L::max_i(lanes, L::splat_i(5))),
                 as_bits(L::floor(L::load(&floats))),
+                L::store_i(L::only_i(front, compressed)),
             ]
         }
     }

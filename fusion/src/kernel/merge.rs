@@ -1,10 +1,10 @@
 //! What the views that agree make of a hypothesis: its depth, its colour, its confidence, and who owns the surface.
 #![allow(unsafe_op_in_unsafe_fn, reason = "the contract of each function covers its body as a whole")]
 
-use super::Input;
 use super::agree::{Answer, Place};
 use super::lanes::{LANES, Lanes, WINDOW_COLUMNS};
 use super::places;
+use super::{Input, first_lanes};
 use crate::geometric::Neighbour;
 use crate::hypotheses::Block;
 
@@ -22,9 +22,10 @@ impl<L: Lanes> Votes<L> {
     /// # Safety
     /// As [`Lanes`].
     #[inline(always)]
-    pub unsafe fn count(block: &Block, answers: &[Answer]) -> Self {
+    pub unsafe fn count(block: &Block<'_>, answers: &[Answer]) -> Self {
         let (zero, one) = (L::splat(0.0), L::splat(1.0));
-        let mut count = L::only(L::less(zero, L::load(&block.own)), one);
+        let own = L::and(first_lanes::<L>(block.count), L::less(zero, L::load(block.own)));
+        let mut count = L::only(own, one);
         let mut agreeing = [L::splat_i(0); 2];
         for (index, answer) in answers.iter().enumerate() {
             let agrees = L::less(zero, L::load(&answer.depth));
@@ -41,9 +42,8 @@ impl<L: Lanes> Votes<L> {
 /// Sums over the views that agree with some hypotheses.
 pub(super) struct Sums<L: Lanes> {
     depth: L::F,
-    /// Red, green and blue.
-    color: [L::I; 3],
-    confidence: L::F,
+    /// Red, green, blue and confidence.
+    color: [L::I; 4],
     /// Whether another view owns the surface.
     beaten: L::M,
 }
@@ -52,10 +52,8 @@ pub(super) struct Sums<L: Lanes> {
 pub(super) struct Means {
     /// Of the reference's depths.
     pub depth: [f32; LANES],
-    /// Red in the lowest byte, then green and blue.
+    /// Red in the lowest byte, then green, blue and the confidence.
     pub color: [i32; LANES],
-    /// In 255ths.
-    pub confidence: [i32; LANES],
     /// Which neighbours agree: the first 32, then the next.
     pub agreeing: [[i32; LANES]; 2],
     /// Whether the reference owns the surface, lane k as bit k.
@@ -68,30 +66,23 @@ impl<L: Lanes> Sums<L> {
     /// # Safety
     /// As [`Lanes`]; the columns are of the reference, whose rasters have one size.
     #[inline(always)]
-    pub unsafe fn of_reference(input: &Input<'_>, y: usize, block: &Block) -> Self {
-        let own = L::load(&block.own);
+    pub unsafe fn of_reference(input: &Input<'_>, y: usize, block: &Block<'_>) -> Self {
+        let own = L::load(block.own);
         let agrees = L::less(L::splat(0.0), own);
-        let (colors, confidences) = (input.reference.color.row(y), input.reference.confidence.row(y));
-        let columns = L::load_i(&block.columns);
+        let colors = input.reference.color.row(y);
+        let columns = L::load_i(block.columns);
         let first = block.columns[0].min(colors.len() as i32 - WINDOW_COLUMNS);
-        let (color, confidence) = if L::PICKS && first >= 0 && block.is_within(WINDOW_COLUMNS) {
-            let at = L::sub_i(columns, L::splat_i(first));
-            let (colors, confidences) = (colors.as_ptr(), confidences.as_ptr());
-            (L::pick_color(colors.add(first as usize), at), L::pick(confidences.add(first as usize), at))
+        let color = if L::PICKS && first >= 0 && block.is_within(WINDOW_COLUMNS) {
+            L::pick_words(colors.as_ptr().add(first as usize), L::sub_i(columns, L::splat_i(first)))
         } else {
-            (places::gather_color::<L>(colors, columns), L::gather(confidences.as_ptr(), columns))
+            L::gather_words(colors.as_ptr(), columns)
         };
-        Self {
-            depth: own,
-            color: channels::<L>(L::only_i(agrees, color)),
-            confidence: L::only(agrees, confidence),
-            beaten: L::less(own, own),
-        }
+        Self { depth: own, color: channels::<L>(L::only_i(agrees, color)), beaten: L::less(own, own) }
     }
 
     /// With what a neighbour has at `place` for hypotheses of depth `d`, where it agrees.
     ///
-    /// A view with a smaller footprint owns the surface, if it is confident: it will not emit it otherwise.
+    /// A view with a smaller footprint owns the surface, if it is confident, to half a 255th: it will not emit it otherwise.
     ///
     /// # Safety
     /// As [`Lanes`]; `answer` is this neighbour's, to what is at `place`, and it agrees with something.
@@ -99,23 +90,27 @@ impl<L: Lanes> Sums<L> {
     pub unsafe fn and(
         self,
         neighbour: &Neighbour<'_>,
-        min_confidence: f32,
+        min_confidence: u8,
         d: L::F,
         (place, answer): (&Place, &Answer),
     ) -> Self {
         let depth = L::load(&answer.depth);
         let agrees = L::less(L::splat(0.0), depth);
-        let (color, confidence) = match place.window {
-            Some(window) => window.pixels::<L>(neighbour, answer),
-            None => places::pixels::<L>(neighbour, answer),
+        let color = match place.window {
+            Some(window) => window.colors::<L>(neighbour, answer, agrees),
+            None => places::colors::<L>(neighbour, answer),
         };
-        let [r, g, b] = channels::<L>(L::only_i(agrees, color));
+        let [r, g, b, confidence] = channels::<L>(L::only_i(agrees, color));
         let smaller = L::less(L::load(&place.z), L::mul(L::splat(neighbour.rival.wins_below), d));
-        let better = L::but_not(smaller, L::less(confidence, L::splat(min_confidence)));
+        let better = L::but_not(smaller, L::below(confidence, min_confidence.into()));
         Self {
             depth: L::add(self.depth, depth),
-            color: [L::add_i(self.color[0], r), L::add_i(self.color[1], g), L::add_i(self.color[2], b)],
-            confidence: L::add(self.confidence, L::only(agrees, confidence)),
+            color: [
+                L::add_i(self.color[0], r),
+                L::add_i(self.color[1], g),
+                L::add_i(self.color[2], b),
+                L::add_i(self.color[3], confidence),
+            ],
             beaten: L::or(self.beaten, L::and(agrees, better)),
         }
     }
@@ -127,31 +122,30 @@ impl<L: Lanes> Sums<L> {
     #[inline(always)]
     pub unsafe fn means(self, votes: &Votes<L>) -> Means {
         let scale = L::div(L::splat(1.0), votes.count);
-        let [r, g, b] = self.color;
-        let (r, g, b) = (L::to_float(r), L::to_float(g), L::to_float(b));
-        let (r, g, b) = (rounded::<L>(r, scale), rounded::<L>(g, scale), rounded::<L>(b, scale));
-        let color = L::add_i(L::add_i(r, L::mul_i(g, L::splat_i(1 << 8))), L::mul_i(b, L::splat_i(1 << 16)));
-        let confidence = rounded::<L>(self.confidence, L::mul(scale, L::splat(255.0)));
+        let [r, g, b, confidence] = self.color;
+        let low = L::or_i(mean::<L>(r, scale), L::mul_i(mean::<L>(g, scale), L::splat_i(1 << 8)));
+        let high = L::or_i(mean::<L>(b, scale), L::mul_i(mean::<L>(confidence, scale), L::splat_i(1 << 8)));
+        let color = L::or_i(low, L::mul_i(high, L::splat_i(1 << 16)));
         Means {
             depth: L::store(L::div(self.depth, votes.count)),
             color: L::store_i(color),
-            confidence: L::store_i(confidence),
             agreeing: [L::store_i(votes.agreeing[0]), L::store_i(votes.agreeing[1])],
             owns: !L::bits(self.beaten),
         }
     }
 }
 
-/// Red, green and blue of colours whose bytes they are, the lowest first.
+/// The bytes, the lowest first.
 #[inline(always)]
-unsafe fn channels<L: Lanes>(color: L::I) -> [L::I; 3] {
+unsafe fn channels<L: Lanes>(color: L::I) -> [L::I; 4] {
     let (byte, eight) = (L::splat_i(255), L::splat_i(8));
     let second = L::shift_down(color, eight);
-    [L::and_i(color, byte), L::and_i(second, byte), L::and_i(L::shift_down(second, eight), byte)]
+    let third = L::shift_down(second, eight);
+    [L::and_i(color, byte), L::and_i(second, byte), L::and_i(third, byte), L::shift_down(third, eight)]
 }
 
-/// The product, rounded to nearest.
+/// The sum times `scale`, rounded to nearest.
 #[inline(always)]
-unsafe fn rounded<L: Lanes>(sum: L::F, scale: L::F) -> L::I {
-    L::truncate(L::mul_add(sum, scale, L::splat(0.5)))
+unsafe fn mean<L: Lanes>(sum: L::I, scale: L::F) -> L::I {
+    L::truncate(L::mul_add(L::to_float(sum), scale, L::splat(0.5)))
 }

@@ -1,8 +1,9 @@
 //! The inner loop of the filter: one row of the reference against all neighbours.
 //!
 //! Sixteen hypotheses at a time are put to each neighbour ([`agree`]), and what those say that agree is summed
-//! ([`merge`]). What is in between fits into the processor's first cache. The loop is compiled for AVX-512, AVX2 and
-//! every other processor; the level is chosen when the program runs, and changes no bit.
+//! ([`merge`]). What is in between fits into the processor's first cache. The loop, and others like it, are written
+//! over [`lanes`] and compiled for AVX-512, AVX2 and every other processor; the [`level`] is chosen when the program
+//! runs, and changes no bit.
 #![allow(
     clippy::inline_always,
     reason = "instructions are enabled by the function that a kernel is inlined into"
@@ -16,62 +17,26 @@ mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 mod lanes;
+mod level;
 mod merge;
 mod places;
 mod window;
 
-use planesweep_scene::DepthMap;
+use planesweep_scene::{DepthMap, in_255ths};
 
 use crate::dynamic::settle;
 use crate::geometric::{Neighbour, RowTransfer};
 use crate::hypotheses::{Block, HypothesisRow};
 use crate::options::{FilterOptions, FusionMethod};
-pub(crate) use agree::Answer;
+pub(crate) use agree::{Answer, transferred};
 use agree::{Limits, Place, compare, fetch_ahead, project};
-pub(crate) use lanes::{LANES, Lanes, Portable};
+#[cfg(test)]
+pub(crate) use lanes::Portable;
+use lanes::WINDOW_COLUMNS;
+pub(crate) use lanes::{COUNTING, LANES, Lanes};
+pub(crate) use level::{Kernel, Level};
 use merge::{Means, Sums, Votes};
 use window::Window;
-
-/// The instructions that the kernel may use.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Level {
-    /// 512-bit registers.
-    #[cfg(target_arch = "x86_64")]
-    Avx512,
-    /// 256-bit registers.
-    #[cfg(target_arch = "x86_64")]
-    Avx2,
-    /// What every target has.
-    Portable,
-}
-
-impl Level {
-    /// The best that the processor has.
-    pub fn detect() -> Self {
-        *Self::available().last().expect("every processor has the portable level")
-    }
-
-    /// All that the processor has, the best last.
-    pub fn available() -> Vec<Self> {
-        let mut levels = vec![Self::Portable];
-        #[cfg(target_arch = "x86_64")]
-        {
-            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-                levels.push(Self::Avx2);
-            }
-            if is_x86_feature_detected!("avx512f")
-                && is_x86_feature_detected!("avx512bw")
-                && is_x86_feature_detected!("avx512dq")
-                && is_x86_feature_detected!("avx512vl")
-                && is_x86_feature_detected!("avx512vbmi")
-                && is_x86_feature_detected!("fma")
-            {
-                levels.push(Self::Avx512);
-            }
-        }
-        levels
-    }
-}
 
 /// What all rows have in common.
 #[derive(Clone, Copy)]
@@ -85,9 +50,8 @@ pub(crate) struct Input<'a> {
 /// A row of each raster of the result, all zeros at first.
 pub(crate) struct OutputRow<'a> {
     pub depth: &'a mut [f32],
-    pub color: &'a mut [[u8; 3]],
+    pub color: &'a mut [[u8; 4]],
     pub views: &'a mut [u8],
-    pub confidence: &'a mut [u8],
     pub agreeing: &'a mut [u64],
     pub owns: &'a mut [bool],
 }
@@ -122,31 +86,17 @@ pub(crate) fn filter_row(
 ) -> usize {
     scratch.transfers.clear();
     scratch.transfers.extend(input.neighbours.iter().map(|neighbour| neighbour.row_transfer(y)));
-    let row = Row { input, y, hypotheses, scratch, out };
-    match input.level {
-        // SAFETY: levels come from `Level::available`, which asked the processor.
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx512 => unsafe { with_avx512(row) },
-        // SAFETY: as above.
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx2 => unsafe { with_avx2(row) },
-        // SAFETY: the portable lanes need nothing of the processor.
-        Level::Portable => unsafe { blocks::<Portable>(row) },
+    input.level.run(Row { input, y, hypotheses, scratch, out })
+}
+
+impl Kernel for Row<'_, '_> {
+    type Output = usize;
+
+    #[inline(always)]
+    unsafe fn run<L: Lanes>(self) -> usize {
+        // SAFETY: the caller vouches for the processor.
+        unsafe { blocks::<L>(self) }
     }
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vbmi,fma")]
-fn with_avx512(row: Row<'_, '_>) -> usize {
-    // SAFETY: this function has the instructions.
-    unsafe { blocks::<avx512::Avx512>(row) }
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,fma")]
-fn with_avx2(row: Row<'_, '_>) -> usize {
-    // SAFETY: as above.
-    unsafe { blocks::<avx2::Avx2>(row) }
 }
 
 /// # Safety
@@ -160,17 +110,21 @@ unsafe fn blocks<L: Lanes>(row: Row<'_, '_>) -> usize {
     answers.resize(neighbours.len(), Answer::default());
     let (mut places, mut next_places) = places.split_at_mut(neighbours.len());
     let limits = Limits::of(options);
+    let min_confidence = in_255ths(options.min_confidence);
     let mut kept = 0;
-    for (block, next) in row.blocks().iter().zip(1..) {
-        // SAFETY: the caller vouches for the processor; places and answers are those of their neighbours, and rasters
-        // of a map have one size: the filter and `Neighbour::new` made sure.
+    let mut blocks = row.blocks().peekable();
+    if let Some(first) = blocks.peek() {
+        // SAFETY: as below.
+        unsafe { project_block::<L>(neighbours, transfers, first, places) };
+    }
+    while let Some(block) = &blocks.next() {
+        // SAFETY: the caller vouches for the processor; places and answers are those of their neighbours; rasters of a
+        // map have one size: the filter and `Neighbour::new` made sure; and all columns of a block, those behind its
+        // hypotheses included, are columns of the reference.
         kept += unsafe {
             // A block ahead, so that nothing waits for the places; and each step for all neighbours, so that the
             // processor works on several of them at once.
-            if next == 1 {
-                project_block::<L>(neighbours, transfers, block, places);
-            }
-            if let Some(next) = row.blocks().get(next) {
+            if let Some(next) = blocks.peek() {
                 project_block::<L>(neighbours, transfers, next, next_places);
             }
             let (x, d) = hypotheses::<L>(block);
@@ -193,7 +147,7 @@ unsafe fn blocks<L: Lanes>(row: Row<'_, '_>) -> usize {
                     let agrees = L::less(L::splat(0.0), L::load(&answer.depth));
                     // So its map has pixels to ask for.
                     if L::bits(agrees) & kept_here != 0 {
-                        sums = sums.and(neighbour, options.min_confidence, d, (place, answer));
+                        sums = sums.and(neighbour, min_confidence, d, (place, answer));
                     }
                 }
                 write_means(block, kept_here, &sums.means(&votes), out);
@@ -211,35 +165,52 @@ unsafe fn blocks<L: Lanes>(row: Row<'_, '_>) -> usize {
 unsafe fn project_block<L: Lanes>(
     neighbours: &[Neighbour<'_>],
     transfers: &[RowTransfer],
-    block: &Block,
+    block: &Block<'_>,
     places: &mut [Place],
 ) {
     // SAFETY: the caller vouches for the processor.
     unsafe {
+        let is_together = block.is_within(WINDOW_COLUMNS);
         let hypotheses = hypotheses::<L>(block);
         for ((neighbour, transfer), place) in neighbours.iter().zip(transfers).zip(&mut *places) {
             project::<L>(neighbour, transfer, hypotheses, place);
         }
         for (neighbour, place) in neighbours.iter().zip(places) {
             place.window = Window::around::<L>(neighbour, place);
-            fetch_ahead::<L>(neighbour, place);
+            // What outliers ask for is not what the next row will.
+            if is_together {
+                fetch_ahead::<L>(neighbour, place);
+            }
         }
     }
 }
 
-/// Columns and depths of a block.
+/// Columns and depths of a block; what lies behind its hypotheses is no number.
 ///
 /// # Safety
 /// As [`Lanes`].
 #[inline(always)]
-unsafe fn hypotheses<L: Lanes>(block: &Block) -> (L::F, L::F) {
+unsafe fn hypotheses<L: Lanes>(block: &Block<'_>) -> (L::F, L::F) {
     // SAFETY: the caller vouches for the processor.
-    unsafe { (L::to_float(L::load_i(&block.columns)), L::load(&block.depths)) }
+    unsafe {
+        let depths = L::select(first_lanes::<L>(block.count), L::load(block.depths), L::splat(f32::NAN));
+        (L::to_float(L::load_i(block.columns)), depths)
+    }
+}
+
+/// The first `count` lanes.
+///
+/// # Safety
+/// As [`Lanes`].
+#[inline(always)]
+unsafe fn first_lanes<L: Lanes>(count: usize) -> L::M {
+    // SAFETY: the caller vouches for the processor.
+    unsafe { L::below(L::load_i(&COUNTING), count as i32) }
 }
 
 /// Writes how many views agree with a block's hypotheses.
 #[inline(always)]
-fn write_views(block: &Block, count: &[i32; LANES], views: &mut [u8]) {
+fn write_views(block: &Block<'_>, count: &[i32; LANES], views: &mut [u8]) {
     for (x, count) in block.columns.iter().zip(count).take(block.count) {
         views[*x as usize] = *count as u8;
     }
@@ -247,13 +218,11 @@ fn write_views(block: &Block, count: &[i32; LANES], views: &mut [u8]) {
 
 /// Writes the hypotheses of a block that are kept.
 #[inline(always)]
-fn write_means(block: &Block, kept: u32, means: &Means, out: &mut OutputRow<'_>) {
+fn write_means(block: &Block<'_>, kept: u32, means: &Means, out: &mut OutputRow<'_>) {
     for k in (0..LANES).filter(|k| kept >> k & 1 == 1) {
         let x = block.columns[k] as usize;
         out.depth[x] = means.depth[k];
-        let [r, g, b, _] = means.color[k].to_le_bytes();
-        out.color[x] = [r, g, b];
-        out.confidence[x] = means.confidence[k] as u8;
+        out.color[x] = means.color[k].to_le_bytes();
         let [low, high] = means.agreeing.map(|bits| u64::from(bits[k] as u32));
         out.agreeing[x] = low | high << 32;
         out.owns[x] = means.owns >> k & 1 == 1;

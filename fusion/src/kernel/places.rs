@@ -40,31 +40,14 @@ fn corners_with_border(neighbour: &Neighbour<'_>, place: &Place) -> [[f32; LANES
     corners
 }
 
-/// Colours, their bytes the lowest three, and confidences of the neighbour's pixels.
+/// Colours and confidences of the neighbour's pixels.
 ///
 /// # Safety
 /// As [`Lanes`]; `answer` is this neighbour's, and it agrees with something: so its map has a pixel.
 #[inline(always)]
-pub(super) unsafe fn pixels<L: Lanes>(neighbour: &Neighbour<'_>, answer: &Answer) -> (L::I, L::F) {
+pub(super) unsafe fn colors<L: Lanes>(neighbour: &Neighbour<'_>, answer: &Answer) -> L::I {
     // SAFETY: the pixels are of the map, the first one in lanes that disagree; its rasters have one size.
-    let at = indices::<L>(neighbour, &answer.column, &answer.row);
-    (gather_color::<L>(neighbour.color, at), L::gather(neighbour.confidence.as_ptr(), at))
-}
-
-/// Colours of a raster, their bytes the lowest three.
-///
-/// # Safety
-/// As [`Lanes`]; `at` are indices of the raster.
-#[inline(always)]
-pub(super) unsafe fn gather_color<L: Lanes>(colors: &[[u8; 3]], at: L::I) -> L::I {
-    if let [[r, g, b]] = colors {
-        return L::splat_i(i32::from_le_bytes([*r, *g, *b, 0]));
-    }
-    let first = L::add_i(L::add_i(at, at), at);
-    // Four bytes are read: those of the last pixel with one before; there are two pixels.
-    let start = L::min_i(first, L::splat_i(3 * colors.len() as i32 - 4));
-    let beyond = L::mul_i(L::sub_i(first, start), L::splat_i(8));
-    L::shift_down(L::gather_bytes(colors.as_ptr().cast(), start), beyond)
+    L::gather_words(neighbour.color.as_ptr(), indices::<L>(neighbour, &answer.column, &answer.row))
 }
 
 /// Indices of a neighbour's pixels.

@@ -8,14 +8,13 @@ use super::agree::{Answer, Place};
 use super::lanes::{LANES, Lanes, WINDOW_COLUMNS};
 use crate::geometric::Neighbour;
 
-/// Rows of a window: those above the places lie in the first three.
-const ROWS: i32 = 4;
+/// From the row of the first place to that of the last; of more, each would have to be read for itself.
+const MAX_ROWS: i32 = 6;
 
-/// The upper left of [`WINDOW_COLUMNS`] columns and [`ROWS`] rows, all of them of the map.
+/// The first of [`WINDOW_COLUMNS`] columns, all of them of the map, in which places lie with the columns behind them.
 #[derive(Clone, Copy)]
 pub(super) struct Window {
     column: i32,
-    row: i32,
 }
 
 impl Window {
@@ -25,8 +24,8 @@ impl Window {
     /// As [`Lanes`]; `place` is of this neighbour.
     #[inline(always)]
     pub unsafe fn around<L: Lanes>(neighbour: &Neighbour<'_>, place: &Place) -> Option<Self> {
-        let [columns, rows] = neighbour.size;
-        if !L::PICKS || place.inside == 0 || place.border != 0 || columns < WINDOW_COLUMNS || rows < ROWS {
+        let columns = neighbour.size[0];
+        if !L::PICKS || place.inside == 0 || place.border != 0 || columns < WINDOW_COLUMNS {
             return None;
         }
         // The remainders spare a check of the index.
@@ -35,14 +34,10 @@ impl Window {
         // In the middle between the first place and the last, and within the map.
         let spare = WINDOW_COLUMNS - 2;
         let column = (place.column[first] + place.column[last] - spare) >> 1;
-        let row = (place.row[first] + place.row[last] - 1) >> 1;
         let column = column.min(columns - WINDOW_COLUMNS).max(0);
-        let row = row.min(rows - ROWS).max(0);
-        let fits = L::and(
-            L::below(L::sub_i(L::load_i(&place.column), L::splat_i(column)), WINDOW_COLUMNS - 1),
-            L::below(L::sub_i(L::load_i(&place.row), L::splat_i(row)), ROWS - 1),
-        );
-        (place.inside & !L::bits(fits) == 0).then_some(Self { column, row })
+        let fits = L::below(L::sub_i(L::load_i(&place.column), L::splat_i(column)), WINDOW_COLUMNS - 1);
+        let is_level = (place.row[last] - place.row[first]).abs() <= MAX_ROWS;
+        (is_level && place.inside & !L::bits(fits) == 0).then_some(Self { column })
     }
 
     /// The depths of the four pixels around the places: the upper left, the upper right, then the lower ones.
@@ -51,56 +46,50 @@ impl Window {
     /// As [`Lanes`]; the window is around `place` in this neighbour.
     #[inline(always)]
     pub unsafe fn corners<L: Lanes>(self, neighbour: &Neighbour<'_>, place: &Place) -> [L::F; 4] {
-        let (at, row) = self.within::<L>(&place.column, &place.row);
+        let at = L::sub_i(L::load_i(&place.column), L::splat_i(self.column));
         let next = L::add_i(at, L::splat_i(1));
+        let rows = L::load_i(&place.row);
         let mut corners = [L::splat(0.0); 4];
-        // Mostly all places lie in one row or two; what is not needed may not be in the cache.
-        for k in 0..ROWS - 1 {
-            let is_there = L::equal(row, L::splat_i(k));
-            if L::bits(is_there) != 0 {
-                let upper = neighbour.depth.as_ptr().add(self.offset(neighbour, k));
-                let lower = upper.add(neighbour.size[0] as usize);
-                let depths =
-                    [L::pick(upper, at), L::pick(upper, next), L::pick(lower, at), L::pick(lower, next)];
-                for (corner, depth) in corners.iter_mut().zip(depths) {
-                    *corner = L::select(is_there, depth, *corner);
-                }
+        // Mostly all places lie in one row or two.
+        let mut left = place.inside;
+        while left != 0 {
+            let row = place.row[left.trailing_zeros() as usize % LANES];
+            let is_there = L::equal(rows, L::splat_i(row));
+            left &= !L::bits(is_there);
+            let upper = neighbour.depth.as_ptr().add(self.offset(neighbour, row));
+            let lower = upper.add(neighbour.size[0] as usize);
+            let depths = [L::pick(upper, at), L::pick(upper, next), L::pick(lower, at), L::pick(lower, next)];
+            for (corner, depth) in corners.iter_mut().zip(depths) {
+                *corner = L::select(is_there, depth, *corner);
             }
         }
         corners
     }
 
-    /// Colours, their bytes the lowest three, and confidences of the neighbour's pixels; anything for those that disagree.
+    /// Colours and confidences of the neighbour's pixels in lanes that agree.
     ///
     /// # Safety
-    /// As [`Lanes`]; the window is around the places that `answer` is for in this neighbour.
+    /// As [`Lanes`]; the window is around the places that `answer` is for in this neighbour, and `agrees` are the lanes
+    /// in which that agrees.
     #[inline(always)]
-    pub unsafe fn pixels<L: Lanes>(self, neighbour: &Neighbour<'_>, answer: &Answer) -> (L::I, L::F) {
-        let (at, row) = self.within::<L>(&answer.column, &answer.row);
-        let color = neighbour.color.as_ptr();
-        let confidence = neighbour.confidence.as_ptr();
-        let mut pixels = (L::splat_i(0), L::splat(0.0));
-        for k in 0..ROWS {
-            let is_there = L::equal(row, L::splat_i(k));
-            if L::bits(is_there) != 0 {
-                let first = self.offset(neighbour, k);
-                pixels.0 = L::select_i(is_there, L::pick_color(color.add(first), at), pixels.0);
-                pixels.1 = L::select(is_there, L::pick(confidence.add(first), at), pixels.1);
-            }
+    pub unsafe fn colors<L: Lanes>(self, neighbour: &Neighbour<'_>, answer: &Answer, agrees: L::M) -> L::I {
+        let at = L::sub_i(L::load_i(&answer.column), L::splat_i(self.column));
+        let rows = L::load_i(&answer.row);
+        let mut colors = L::splat_i(0);
+        let mut left = L::bits(agrees);
+        while left != 0 {
+            let row = answer.row[left.trailing_zeros() as usize % LANES];
+            let is_there = L::equal(rows, L::splat_i(row));
+            left &= !L::bits(is_there);
+            let first = neighbour.color.as_ptr().add(self.offset(neighbour, row));
+            colors = L::select_i(is_there, L::pick_words(first, at), colors);
         }
-        pixels
-    }
-
-    /// Columns and rows of the window.
-    #[inline(always)]
-    unsafe fn within<L: Lanes>(self, columns: &[i32; LANES], rows: &[i32; LANES]) -> (L::I, L::I) {
-        let column = L::sub_i(L::load_i(columns), L::splat_i(self.column));
-        (column, L::sub_i(L::load_i(rows), L::splat_i(self.row)))
+        colors
     }
 
     /// Index of the first pixel of a row.
     #[inline(always)]
     fn offset(self, neighbour: &Neighbour<'_>, row: i32) -> usize {
-        (self.row + row) as usize * neighbour.size[0] as usize + self.column as usize
+        row as usize * neighbour.size[0] as usize + self.column as usize
     }
 }

@@ -224,9 +224,9 @@ fn emit_all(
 }
 
 /// Bytes of memory of a pixel of a depth map.
-const MAP_PIXEL_BYTES: u64 = 4 + 4 + 3;
+const MAP_PIXEL_BYTES: u64 = 4 + 4 + 4;
 /// Bytes of memory of a pixel of a filtered map.
-const FILTERED_PIXEL_BYTES: u64 = 4 + 3 + 1 + 1 + 8 + 1;
+const FILTERED_PIXEL_BYTES: u64 = 4 + 4 + 1 + 8 + 1;
 
 /// Filtered maps on disk.
 struct Scratch<'a> {

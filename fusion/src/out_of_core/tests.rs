@@ -99,7 +99,7 @@ fn damaged_scratch_files_are_named() {
     let folder = tempfile::tempdir().expect("a folder");
     let work = work(&folder.path().join("a"));
     run(&work, &good);
-    fs::write(work.scratch.join("00000003.filtered"), b"PSFILTR2").expect("written");
+    fs::write(work.scratch.join("00000003.filtered"), b"PSFILTR3").expect("written");
     let error = fuse_out_of_core(&work, &good, &mut |_| {}, &mut |_| Ok(())).expect_err("damaged");
     assert!(error.to_string().contains("00000003.filtered is damaged"), "{error}");
 }

@@ -1,7 +1,8 @@
+use nalgebra::{Point2, Point3};
 use planesweep_scene::DepthMap;
 
 use super::*;
-use crate::analytic::{Surface, camera_at};
+use crate::analytic::{Surface, camera_at, set_confidence};
 use crate::filter::filter;
 use crate::options::FilterOptions;
 
@@ -60,6 +61,88 @@ fn assert_no_hole(filtered: &[FilteredMap], emissions: &[Raster<bool>]) -> (usiz
         }
     }
     (kept, cloud.len())
+}
+
+/// Whether a pixel of `map` that owns its surface has the point in it; `None` where rounding decides.
+fn covers(map: &FilteredMap, point: &Point3<f64>, max_relative_depth: f64) -> Option<bool> {
+    let Some((pixel, depth)) = map.camera.project(point) else { return Some(false) };
+    let [x, y] = [pixel.x, pixel.y].map(|at| at + 0.5);
+    if [x, y].iter().any(|at| (at - at.round()).abs() < 1e-3) {
+        return None;
+    }
+    let seen = map.depth.get(x.floor().max(-1.0) as usize, y.floor().max(-1.0) as usize);
+    let within = x > 0.0 && y > 0.0;
+    let Some(seen) = seen.filter(|seen| within && *seen > 0.0) else { return Some(false) };
+    let relative = (f64::from(seen) - depth).abs() / depth;
+    let owns = map.owns.at(x as usize, y as usize);
+    ((relative - max_relative_depth).abs() > 1e-5).then_some(owns && relative < max_relative_depth)
+}
+
+#[test]
+fn every_level_drops_what_owners_cover() {
+    let places = [(0.0, 0.0, 1.0), (0.3, 0.1, 1.2), (-0.2, 0.3, 1.25), (0.1, -0.4, 0.9), (0.0, 0.0, -1.0)];
+    let maps = places.map(|(x, y, nearer)| Surface::BallBeforePlane.map(closer(x, y, nearer)));
+    let all: Vec<&DepthMap> = maps.iter().collect();
+    let filtered: Vec<FilteredMap> = maps.iter().map(|map| filter(map, &all, &options())).collect();
+    let (map, others) = (&filtered[0], filtered[1..].iter().collect::<Vec<_>>());
+    let emitted = emitted(map, &others, 0.01);
+    let (mut dropped, mut undecided) = (0, 0);
+    for (x, y) in (0..30).flat_map(|y| (0..40).map(move |x| (x, y))) {
+        let point = map.camera.unproject(&Point2::new(x as f64, y as f64), map.depth.at(x, y).into());
+        let covering: Vec<_> = others.iter().map(|other| covers(other, &point, 0.01)).collect();
+        if covering.contains(&None) {
+            undecided += 1;
+            continue;
+        }
+        let is_covered = covering.contains(&Some(true));
+        let expected = map.depth.at(x, y) > 0.0 && (map.owns.at(x, y) || !is_covered);
+        assert_eq!(emitted.at(x, y), expected, "{x}, {y}");
+        dropped += usize::from(!expected);
+    }
+    assert!(dropped > 400 && dropped < 1100 && undecided < 60, "{dropped} dropped, {undecided} undecided");
+    for level in Level::available() {
+        assert!(emitted_with(level, map, &others, 0.01) == emitted, "{level:?}");
+    }
+}
+
+#[test]
+fn rows_of_any_width_and_maps_of_any_size_are_emitted_alike_on_every_level() {
+    let sized = |x: f64, width: u32, height: u32| {
+        let mut camera = camera_at(x, 0.0, width.max(1), height.max(1));
+        camera.intrinsics.fx = 40.0;
+        camera.intrinsics.fy = 40.0;
+        let map = filter(&PLANE.map(camera), &[], &options());
+        let mut cut = map.clone();
+        if width * height == 0 {
+            cut.depth = Raster::filled(0, 0, 0.0);
+            cut.owns = Raster::filled(0, 0, false);
+        }
+        cut
+    };
+    let others =
+        [(1, 1), (1, 9), (0, 0), (33, 2), (17, 30)].map(|(width, height)| sized(0.02, width, height));
+    let others: Vec<&FilteredMap> = others.iter().collect();
+    for width in [1, 2, 15, 16, 17, 31, 32, 33] {
+        let mut map = sized(0.0, width, 7);
+        map.owns.values_mut().iter_mut().step_by(3).for_each(|owns| *owns = false);
+        let emitted = emitted(&map, &others, 0.01);
+        let count = emitted.values().iter().filter(|emitted| **emitted).count();
+        assert!(
+            count < emitted.values().len() && 2 * count > emitted.values().len(),
+            "{count} of {width} columns"
+        );
+        for level in Level::available() {
+            assert!(emitted_with(level, &map, &others, 0.01) == emitted, "{level:?}, {width} columns");
+        }
+    }
+}
+
+#[test]
+#[should_panic(expected = "owners of a map")]
+fn a_map_whose_owners_have_another_size_is_refused() {
+    let mut map = filter(&PLANE.map(camera_at(0.0, 0.0, 8, 6)), &[], &options());
+    map.owns = Raster::filled(7, 6, true);
+    emitted(&map, &[], 0.01);
 }
 
 #[test]
@@ -121,7 +204,7 @@ fn where_the_owner_was_filtered_out_the_others_emit() {
     // The closer view is unsure of a block in its middle.
     for y in 10..20 {
         for x in 15..25 {
-            maps[1].confidence.values_mut()[y * 40 + x] = 0.1;
+            set_confidence(&mut maps[1], x, y, 0.1);
         }
     }
     let mut filtered = filtered(&maps, &graph);

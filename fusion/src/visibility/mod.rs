@@ -5,6 +5,11 @@
 //! Two kinds of evidence speak against a candidate: a rendered depth in front of it *occludes* it, so
 //! it should not be seen here; and a view that sees something behind it along its own line of sight
 //! finds its place empty, a *violation of free space*.
+#![allow(
+    unsafe_code,
+    clippy::inline_always,
+    reason = "compiled for the instructions of the processor, as the kernel"
+)]
 
 mod confidence;
 mod render;
@@ -15,6 +20,7 @@ use rayon::prelude::*;
 
 use crate::geometric::{Neighbour, RowTransfer};
 use crate::hypotheses::{Hypothesis, HypothesisRow};
+use crate::kernel::{Kernel, Lanes, Level};
 use crate::options::{FilterOptions, FusionMethod};
 use render::{Rendered, render};
 
@@ -31,6 +37,7 @@ pub(crate) struct Candidates<'a> {
     neighbours: &'a [Neighbour<'a>],
     rendered: Vec<Rendered>,
     options: &'a FilterOptions,
+    level: Level,
 }
 
 /// How many pixels of a row had something to choose from.
@@ -51,23 +58,33 @@ pub(crate) struct Scratch {
 
 impl<'a> Candidates<'a> {
     /// Renders the confident depths of all neighbours into the reference.
-    pub fn new(reference: &'a DepthMap, neighbours: &'a [Neighbour<'a>], options: &'a FilterOptions) -> Self {
+    pub fn new(
+        reference: &'a DepthMap,
+        neighbours: &'a [Neighbour<'a>],
+        options: &'a FilterOptions,
+        level: Level,
+    ) -> Self {
         let (width, height) = (reference.width(), reference.height());
         let rendered = neighbours
             .par_iter()
-            .map(|neighbour| render(neighbour, width, height, options.min_confidence))
+            .map(|neighbour| render(level, neighbour, width, height, options.min_confidence))
             .collect();
-        Self { reference, neighbours, rendered, options }
+        Self { reference, neighbours, rendered, options, level }
     }
 
     /// Chooses the hypotheses of row `y`: at most one depth for each pixel.
-    #[inline(always)]
-    #[allow(clippy::inline_always)] // compiled once per instruction set
     pub fn choose(&self, y: usize, scratch: &mut Scratch, row: &mut HypothesisRow) -> RowCounts {
+        scratch.transfers.clear();
+        scratch.transfers.extend(self.neighbours.iter().map(|neighbour| neighbour.row_transfer(y)));
+        row.clear(self.reference.width());
+        let counts = self.level.run(Choice { candidates: self, y, scratch, row });
+        row.end();
+        counts
+    }
+
+    #[inline(always)]
+    fn choose_each(&self, y: usize, scratch: &mut Scratch, row: &mut HypothesisRow) -> RowCounts {
         let Scratch { candidates, transfers } = scratch;
-        transfers.clear();
-        transfers.extend(self.neighbours.iter().map(|neighbour| neighbour.row_transfer(y)));
-        row.clear();
         let mut counts = RowCounts::default();
         for x in 0..self.reference.width() {
             let (depth, confidence) = (self.reference.depth.at(x, y), self.reference.confidence.at(x, y));
@@ -90,8 +107,24 @@ impl<'a> Candidates<'a> {
                 row.push(Hypothesis { column: x as i32, depth: chosen, own });
             }
         }
-        row.end();
         counts
+    }
+}
+
+/// The choice of a row, compiled for the instructions of the processor.
+struct Choice<'a, 'b> {
+    candidates: &'a Candidates<'b>,
+    y: usize,
+    scratch: &'a mut Scratch,
+    row: &'a mut HypothesisRow,
+}
+
+impl Kernel for Choice<'_, '_> {
+    type Output = RowCounts;
+
+    #[inline(always)]
+    unsafe fn run<L: Lanes>(self) -> RowCounts {
+        self.candidates.choose_each(self.y, self.scratch, self.row)
     }
 }
 

@@ -1,9 +1,15 @@
 //! A neighbour's depth map as the reference sees it.
+#![allow(
+    unsafe_code,
+    clippy::inline_always,
+    reason = "compiled for the instructions of the processor, as the kernel"
+)]
 
 use planesweep_scene::Raster;
 
 use super::Candidate;
 use crate::geometric::Neighbour;
+use crate::kernel::{Kernel, Lanes, Level};
 
 /// The nearest confident depth of one neighbour at each pixel of the reference.
 pub(crate) struct Rendered {
@@ -26,46 +32,70 @@ impl Rendered {
 /// Where the reference sees the surface larger than the neighbour does, pixels stay empty in between:
 /// they have one candidate less.
 pub(crate) fn render(
+    level: Level,
     neighbour: &Neighbour<'_>,
     width: usize,
     height: usize,
     min_confidence: f32,
 ) -> Rendered {
-    let map = neighbour.map;
-    let mut depths = Raster::filled(width, height, 0.0_f32);
-    let mut confidences = Raster::filled(width, height, 0.0_f32);
-    for y in 0..map.height() {
-        let transfer = neighbour.row_back(y);
-        for (x, (&depth, &confidence)) in map.depth.row(y).iter().zip(map.confidence.row(y)).enumerate() {
-            if !(depth > 0.0 && confidence >= min_confidence) {
-                continue;
-            }
-            let (u, v, z) = transfer.project(x as f32, depth);
-            if !(u > -0.5 && v > -0.5 && u < width as f32 - 0.5 && v < height as f32 - 0.5 && z.is_finite()) {
-                continue;
-            }
-            let index = (v + 0.5) as usize * width + (u + 0.5) as usize;
-            let nearest = &mut depths.values_mut()[index];
-            if *nearest == 0.0 || z < *nearest {
-                *nearest = z;
-                confidences.values_mut()[index] = confidence;
+    let depth = Raster::filled(width, height, 0.0_f32);
+    let confidence = Raster::filled(width, height, 0.0_f32);
+    let mut rendered = Rendered { depth, confidence };
+    level.run(Rendering { neighbour, min_confidence, rendered: &mut rendered });
+    rendered
+}
+
+struct Rendering<'a, 'b> {
+    neighbour: &'a Neighbour<'b>,
+    min_confidence: f32,
+    rendered: &'a mut Rendered,
+}
+
+impl Kernel for Rendering<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    unsafe fn run<L: Lanes>(self) {
+        let map = self.neighbour.map;
+        let Rendered { depth: depths, confidence: confidences } = self.rendered;
+        let (width, height) = (depths.width(), depths.height());
+        for y in 0..map.height() {
+            let transfer = self.neighbour.row_back(y);
+            for (x, (&depth, &confidence)) in map.depth.row(y).iter().zip(map.confidence.row(y)).enumerate() {
+                if !(depth > 0.0 && confidence >= self.min_confidence) {
+                    continue;
+                }
+                let (u, v, z) = transfer.project(x as f32, depth);
+                if !(u > -0.5
+                    && v > -0.5
+                    && u < width as f32 - 0.5
+                    && v < height as f32 - 0.5
+                    && z.is_finite())
+                {
+                    continue;
+                }
+                let index = (v + 0.5) as usize * width + (u + 0.5) as usize;
+                let nearest = &mut depths.values_mut()[index];
+                if *nearest == 0.0 || z < *nearest {
+                    *nearest = z;
+                    confidences.values_mut()[index] = confidence;
+                }
             }
         }
     }
-    Rendered { depth: depths, confidence: confidences }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::analytic::{Surface, camera_at};
+    use crate::analytic::{Surface, camera_at, set_confidence};
 
     #[test]
     fn the_nearest_surface_is_seen_where_it_lies() {
         let surface = Surface::BallBeforePlane;
         let (reference, neighbour) =
             (surface.map(camera_at(0.0, 0.0, 80, 60)), surface.map(camera_at(0.5, 0.1, 80, 60)));
-        let rendered = render(&Neighbour::new(&reference.camera, &neighbour), 80, 60, 0.8);
+        let rendered = render(Level::detect(), &Neighbour::new(&reference.camera, &neighbour), 80, 60, 0.8);
         let (mut same, mut hidden) = (0, 0);
         for y in 0..60 {
             for x in 0..80 {
@@ -87,13 +117,15 @@ mod tests {
     #[test]
     fn doubtful_depths_and_what_lies_outside_are_not_drawn() {
         let mut map = Surface::Plane { slope: 0.0 }.map(camera_at(0.0, 0.0, 10, 8));
-        map.confidence = Raster::from_fn(10, 8, |x, _| if x < 5 { 0.7 } else { 0.9 });
-        let rendered = render(&Neighbour::new(&map.camera, &map), 10, 8, 0.8);
+        for (x, y) in (0..10).flat_map(|x| (0..8).map(move |y| (x, y))) {
+            set_confidence(&mut map, x, y, if x < 5 { 0.7 } else { 0.9 });
+        }
+        let rendered = render(Level::detect(), &Neighbour::new(&map.camera, &map), 10, 8, 0.8);
         for x in 0..10 {
             assert_eq!(rendered.at(x, 3).is_some(), x >= 5);
         }
         let away = camera_at(90.0, 0.0, 10, 8);
-        let rendered = render(&Neighbour::new(&away, &map), 10, 8, 0.0);
+        let rendered = render(Level::detect(), &Neighbour::new(&away, &map), 10, 8, 0.0);
         assert!(rendered.depth.values().iter().filter(|depth| **depth > 0.0).count() < 80);
     }
 }

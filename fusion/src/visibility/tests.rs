@@ -1,8 +1,9 @@
 use planesweep_scene::Raster;
 
 use super::*;
-use crate::analytic::{Surface, camera_at};
+use crate::analytic::{Surface, camera_at, set_confidence};
 use crate::filter::{FilteredMap, filter};
+use crate::kernel::Level;
 
 const PLANE: Surface = Surface::Plane { slope: 0.2 };
 const PLACES: [(f64, f64); 5] = [(0.0, 0.0), (0.4, 0.0), (-0.4, 0.1), (0.1, 0.4), (0.0, -0.3)];
@@ -36,13 +37,13 @@ fn a_wrong_depth_is_replaced_by_what_the_others_see() {
             let mut maps = truth.clone();
             scale_block(&mut maps[0], factor);
             // Of equally confident depths the reference's own comes first.
-            block().for_each(|(x, y)| maps[0].confidence.values_mut()[y * 60 + x] = 0.9);
+            block().for_each(|(x, y)| set_confidence(&mut maps[0], x, y, 0.9));
             let fused = fuse(&maps, method, 3);
             for (x, y) in block() {
                 let (depth, truth) = (fused.depth.at(x, y), truth[0].depth.at(x, y));
                 assert!((depth - truth).abs() < 2e-3 * truth, "{method:?} {factor}: {depth} for {truth}");
                 assert_eq!(fused.views.at(x, y), 4, "the reference does not agree");
-                let (mean, own) = (fused.color.at(x, y), maps[0].color.at(x, y));
+                let (mean, own) = (fused.color.at(x, y), maps[0].rgb(x, y));
                 assert!(mean.iter().zip(own).all(|(a, b)| a.abs_diff(b) <= 3), "{mean:?} for {own:?}");
             }
         }
@@ -68,7 +69,7 @@ fn a_doubtful_pixel_gets_the_depth_of_its_neighbours() {
     for method in METHODS {
         let truth = maps(PLANE);
         let mut maps = truth.clone();
-        block().for_each(|(x, y)| maps[0].confidence.values_mut()[y * 60 + x] = 0.2);
+        block().for_each(|(x, y)| set_confidence(&mut maps[0], x, y, 0.2));
         let fused = fuse(&maps, method, 3);
         for (x, y) in block() {
             let (depth, truth) = (fused.depth.at(x, y), truth[0].depth.at(x, y));
@@ -108,8 +109,12 @@ fn choose(depths: &[(f32, f32)], method: FusionMethod) -> Option<f32> {
         maps[1..].iter().map(|map| Neighbour::new(&maps[0].camera, map)).collect();
     let options = FilterOptions { method, min_confidence: 0.5, ..FilterOptions::default() };
     let mut row = HypothesisRow::default();
-    Candidates::new(&maps[0], &neighbours, &options).choose(0, &mut Scratch::default(), &mut row);
-    row.blocks().first().map(|block| block.depths[0])
+    Candidates::new(&maps[0], &neighbours, &options, Level::detect()).choose(
+        0,
+        &mut Scratch::default(),
+        &mut row,
+    );
+    row.blocks().next().map(|block| block.depths[0])
 }
 
 #[test]
