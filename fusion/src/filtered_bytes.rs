@@ -124,11 +124,12 @@ pub fn decode_filtered_map(bytes: &[u8]) -> Result<FilteredMap, FilteredMapError
         camera: Camera { intrinsics, pose },
         depth: Raster::filled(columns, rows, 0.0),
         color: Raster::filled(columns, rows, [0; 4]),
-        views: Raster::new(columns, rows, views.to_vec()).expect("as many bytes as pixels"),
+        views: Raster::filled(columns, rows, 0),
         agreeing: Raster::filled(columns, rows, 0),
         owns: Raster::filled(columns, rows, false),
         funnel,
     };
+    map.views.values_mut().copy_from_slice(views);
     put_at(map.depth.values_mut(), &kept, |slot| f32::from_le_bytes(depths[slot]));
     put_at(map.color.values_mut(), &kept, |slot| colors[slot]);
     put_at(map.agreeing.values_mut(), &kept, |slot| u64::from_le_bytes(agreeing[slot]));

@@ -65,7 +65,7 @@ impl DepthMap {
         for c in confidence.values_mut() {
             *c = if c.is_nan() { 0.0 } else { c.clamp(0.0, 1.0) };
         }
-        let color = with_confidence(&color, &confidence);
+        let color = with_confidence(color.into_values(), &confidence);
         Ok(Self { camera, depth, confidence, color })
     }
 
@@ -102,10 +102,17 @@ impl DepthMap {
 }
 
 /// Colours, and beside each the confidence in 255ths.
-pub(crate) fn with_confidence(color: &Raster<[u8; 3]>, confidence: &Raster<f32>) -> Raster<[u8; 4]> {
-    let words = color.values().iter().zip(confidence.values());
-    let words = words.map(|(&[r, g, b], confidence)| [r, g, b, in_255ths(*confidence)]);
-    Raster::new(color.width(), color.height(), words.collect()).expect("the colours had that size")
+///
+/// # Panics
+/// When there are fewer colours than confidences.
+pub(crate) fn with_confidence(
+    colors: impl IntoIterator<Item = [u8; 3]>,
+    confidence: &Raster<f32>,
+) -> Raster<[u8; 4]> {
+    let words = colors.into_iter().zip(confidence.values());
+    let words = words.map(|([r, g, b], confidence)| [r, g, b, in_255ths(*confidence)]);
+    Raster::new(confidence.width(), confidence.height(), words.collect())
+        .expect("a colour for each confidence")
 }
 
 /// A confidence as the fourth byte of [`DepthMap::color`], rounded: what is less is never more there, what lies outside

@@ -38,7 +38,7 @@ impl DepthMap {
             },
         );
         let camera = Camera { intrinsics: *k, pose: self.camera.pose };
-        let color = with_confidence(&image.pixels, &confidence);
+        let color = with_confidence(image.pixels.values().iter().copied(), &confidence);
         DepthMap { camera, depth, confidence, color }
     }
 }
