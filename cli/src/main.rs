@@ -30,7 +30,16 @@ use crate::args::{Cli, Command};
 use crate::console::{Outcome, UsageError};
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => {
+            // Whoever reads JSON finds the error where all others are; help is asked for by people.
+            if error.use_stderr() && std::env::args_os().any(|argument| argument == "--json") {
+                print_error(what_is_wrong(&error.to_string()));
+            }
+            error.exit();
+        }
+    };
     console::start_logging(cli.verbose);
     let json = cli.json;
     let done = match cli.command {
@@ -61,7 +70,7 @@ fn main() -> ExitCode {
         }
         Err(error) => {
             if json {
-                let _ = writeln!(stdout(), "{}", serde_json::json!({ "error": format!("{error:#}") }));
+                print_error(&format!("{error:#}"));
             }
             eprintln!("planesweep: {error:#}");
             if error.is::<UsageError>() {
@@ -70,4 +79,15 @@ fn main() -> ExitCode {
             commands::worker::exit_code(&error).map_or(ExitCode::FAILURE, ExitCode::from)
         }
     }
+}
+
+/// What a usage error says before it explains the usage.
+fn what_is_wrong(usage_error: &str) -> &str {
+    let what = usage_error.split("\n\n").next().unwrap_or(usage_error);
+    what.strip_prefix("error: ").unwrap_or(what)
+}
+
+/// An error for programs (`--json`).
+fn print_error(error: &str) {
+    let _ = writeln!(stdout(), "{}", serde_json::json!({ "error": error }));
 }

@@ -266,6 +266,55 @@ fn a_scene_without_a_usable_view_says_why() {
 }
 
 #[test]
+fn a_damaged_depth_map_is_left_out_of_what_is_measured() {
+    let bench = Bench::new(|folder| courtyard(folder, 8, 96, 96));
+    let _ = bench.reconstruct("out", &ANALYTIC).expect_code(0);
+    let (out, truth) = (bench.path("out"), bench.path("scene/depth_gt"));
+    let map = |view: u32| bench.path(&format!("out/depth/{view:08}.pfm"));
+    fs::write(map(3), b"Pf").expect("written");
+    let commands = [
+        vec!["evaluate", "depth", &out, &truth],
+        vec!["evaluate", "consistency", &out],
+        vec!["evaluate", "photometric", &out],
+    ];
+    for command in &commands {
+        let measured = run([command.as_slice(), &["--json"]].concat()).expect_code(3).json();
+        let views =
+            [&measured["views"], &measured["mean"]["views"]].into_iter().find_map(serde_json::Value::as_u64);
+        assert_eq!(views, Some(7), "{command:?}");
+        let skipped = measured["skipped"].as_object().expect("reasons by view");
+        assert_eq!(skipped.keys().collect::<Vec<_>>(), ["00000003.png"], "{command:?}");
+        let printed = run(command).expect_code(3).stdout;
+        assert!(printed.contains("skipped: 00000003.png: ") && printed.contains(&map(3)), "{printed}");
+    }
+    for view in 0..8 {
+        fs::write(map(view), b"Pf").expect("written");
+    }
+    for command in &commands {
+        let refused = run(command).expect_code(1).stderr;
+        assert!(refused.contains(&map(0)) && refused.contains("and 5 more"), "{refused}");
+    }
+}
+
+#[test]
+fn usage_errors_are_json_for_programs() {
+    for (arguments, named) in [
+        (vec!["--json", "inspect"], "SCENE"),
+        (vec!["inspect", "scene", "--no-such-option", "--json"], "--no-such-option"),
+    ] {
+        let refused = run(&arguments).expect_code(2);
+        assert!(
+            refused.json()["error"].as_str().is_some_and(|error| error.contains(named)),
+            "{}",
+            refused.stdout
+        );
+        assert!(refused.stderr.contains("Usage: "), "{}", refused.stderr);
+    }
+    assert!(run(["inspect"]).expect_code(2).stdout.is_empty());
+    assert!(run(["--json", "--help"]).expect_code(0).stdout.contains("Usage: "));
+}
+
+#[test]
 fn truth_that_is_not_there_is_named() {
     let bench = of_plane(4);
     let _ = bench.reconstruct("out", &ANALYTIC).expect_code(0);

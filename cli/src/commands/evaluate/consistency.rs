@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use serde_json::json;
 
 use super::figures::Figures;
+use super::skipped::split;
 use crate::console::{Outcome, table};
 use crate::run_record::{RecordedView, RunRecord};
 
@@ -39,11 +40,12 @@ const STEPS: u32 = 10;
 /// Counts.
 pub fn run(args: &ConsistencyArgs) -> Result<Outcome> {
     let record = RunRecord::read(&args.result)?;
-    let read = |view: &RecordedView| Ok((view.id, read_ranked(&args.result, view)?));
-    let maps: BTreeMap<ViewId, DepthMap> =
-        record.views.par_iter().map(read).collect::<Result<Vec<_>>>()?.into_iter().collect();
+    let read =
+        |view: &RecordedView| (view.name.clone(), read_ranked(&args.result, view).map(|map| (view.id, map)));
+    let (maps, skipped) = split(record.views.par_iter().map(read).collect());
+    let maps: BTreeMap<ViewId, DepthMap> = maps.into_iter().collect();
     if maps.is_empty() {
-        bail!("{} has no depth map", args.result.display());
+        bail!("{} has no depth map{}", args.result.display(), skipped.reasons());
     }
     let consistent: Vec<(f64, f64)> = (1..=STEPS)
         .map(|step| {
@@ -54,18 +56,23 @@ pub fn run(args: &ConsistencyArgs) -> Result<Outcome> {
                 min_views: args.min_views,
                 ..FilterOptions::default()
             };
-            let shares = record.views.iter().map(|view| {
+            let shares = record.views.iter().filter_map(|view| {
                 let neighbours: Vec<&DepthMap> =
                     view.neighbours.iter().filter_map(|id| maps.get(id)).collect();
-                let funnel = filter(&maps[&view.id], &neighbours, &options).funnel;
-                funnel.geometric as f64 / funnel.photometric.max(1) as f64
+                let funnel = filter(maps.get(&view.id)?, &neighbours, &options).funnel;
+                Some(funnel.geometric as f64 / funnel.photometric.max(1) as f64)
             });
             (kept, shares.sum::<f64>() / maps.len() as f64)
         })
         .collect();
     let curve: Vec<_> =
         consistent.iter().map(|(kept, share)| json!({ "kept": kept, "consistent": share })).collect();
-    let value = json!({ "views": maps.len(), "min_views": args.min_views, "curve": curve });
+    let value = json!({
+        "views": maps.len(),
+        "min_views": args.min_views,
+        "curve": curve,
+        "skipped": skipped.value(),
+    });
     if let Some(folder) = &args.out {
         let figures = Figures::create(folder)?;
         figures.json("consistency", &value)?;
@@ -75,12 +82,13 @@ pub fn run(args: &ConsistencyArgs) -> Result<Outcome> {
     let percent = |share: f64| format!("{:.1} %", 100.0 * share);
     rows.extend(consistent.iter().map(|(kept, share)| vec![percent(*kept), percent(*share)]));
     let text = format!(
-        "mean over {} views: share of the most confident pixels that {} views agree on\n{}",
+        "{}mean over {} views: share of the most confident pixels that {} views agree on\n{}",
+        skipped.lines(),
         maps.len(),
         args.min_views,
         table(&rows)
     );
-    Ok(Outcome { text, value, skipped_views: false })
+    Ok(Outcome { text, value, skipped_views: !skipped.is_empty() })
 }
 
 /// A depth map whose confidence is the share of its pixels that are less confident.

@@ -14,6 +14,7 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use super::figures::Figures;
+use super::skipped::split;
 use crate::args::values::share;
 use crate::console::{Outcome, table};
 use crate::run_record::{RecordedView, RunRecord};
@@ -48,15 +49,16 @@ pub fn run(args: &DepthArgs) -> Result<Outcome> {
     if !args.truth.is_dir() {
         bail!("cannot find the folder {} with true depth", args.truth.display());
     }
-    let measured: Vec<Option<Measured>> =
-        record.views.par_iter().map(|view| measure(args, view)).collect::<Result<_>>()?;
+    let (measured, skipped) =
+        split(record.views.par_iter().map(|view| (view.name.clone(), measure(args, view))).collect());
     let measured: Vec<Measured> = measured.into_iter().flatten().collect();
     let errors: Vec<DepthErrors> = measured.iter().map(|view| view.errors.clone()).collect();
     let Some(means) = DepthMeans::of(&errors) else {
         bail!(
-            "no view of {} has both a depth map and true depth NAME.pfm in {}",
+            "no view of {} has both a depth map and true depth NAME.pfm in {}{}",
             args.result.display(),
-            args.truth.display()
+            args.truth.display(),
+            skipped.reasons()
         );
     };
     let views: Vec<Value> =
@@ -68,11 +70,12 @@ pub fn run(args: &DepthArgs) -> Result<Outcome> {
         "by_confidence": means.confident,
         "curve": means.curve,
     });
-    let value = json!({ "mean": mean, "views": views });
+    let value = json!({ "mean": mean, "views": views, "skipped": skipped.value() });
     if let Some(folder) = &args.out {
         write_figures(&Figures::create(folder)?, &measured, &means, &value)?;
     }
-    Ok(Outcome { text: text(&measured, &means), value, skipped_views: false })
+    let text = skipped.lines() + &text(&measured, &means);
+    Ok(Outcome { text, value, skipped_views: !skipped.is_empty() })
 }
 
 fn measure(args: &DepthArgs, view: &RecordedView) -> Result<Option<Measured>> {

@@ -6,6 +6,7 @@ mod dtu;
 mod eth3d;
 mod figures;
 mod photometric;
+mod skipped;
 mod tnt;
 
 use std::path::{Path, PathBuf};

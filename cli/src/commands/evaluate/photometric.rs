@@ -13,9 +13,11 @@ use planesweep_scene::{
     undistorted_intrinsics,
 };
 use rayon::prelude::*;
+use serde::Serialize;
 use serde_json::json;
 
 use super::figures::Figures;
+use super::skipped::split;
 use crate::console::{Outcome, table};
 use crate::run_record::{RecordedView, RunRecord};
 
@@ -49,22 +51,25 @@ pub fn run(args: &PhotometricArgs) -> Result<Outcome> {
     };
     let pairs: Vec<(&RecordedView, &RecordedView)> =
         record.views.iter().filter_map(|view| Some((view, held_out(view)?))).collect();
-    let measured: Vec<PhotometricErrors> = pairs
-        .par_iter()
-        .map(|(view, other)| {
-            measure(args, &record, view, other).with_context(|| format!("cannot judge view {}", view.name))
-        })
-        .collect::<Result<_>>()?;
+    let judge = |(view, other): &(&RecordedView, &RecordedView)| {
+        let errors = measure(args, &record, view, other);
+        let judged =
+            errors.map(|errors| Judged { view: view.name.clone(), held_out: other.name.clone(), errors });
+        (view.name.clone(), judged)
+    };
+    let (measured, skipped) = split(pairs.par_iter().map(judge).collect());
     let curve = mean_curve(&measured);
-    if curve.is_empty() {
+    if curve.is_empty() && skipped.is_empty() {
         bail!("no view of {} overlaps with one that is no source of it", args.result.display());
     }
-    let views: Vec<_> = pairs
-        .iter()
-        .zip(&measured)
-        .map(|((view, other), errors)| json!({ "view": view.name, "held_out": other.name, "errors": errors }))
-        .collect();
-    let value = json!({ "mean": { "views": measured.len(), "curve": curve }, "views": views });
+    if curve.is_empty() {
+        bail!("no view of {} could be judged{}", args.result.display(), skipped.reasons());
+    }
+    let value = json!({
+        "mean": { "views": measured.len(), "curve": curve },
+        "views": measured,
+        "skipped": skipped.value(),
+    });
     if let Some(folder) = &args.out {
         let figures = Figures::create(folder)?;
         figures.json("photometric", &value)?;
@@ -77,16 +82,27 @@ pub fn run(args: &PhotometricArgs) -> Result<Outcome> {
             |(place, _): (usize, _)| curve.get(place).map_or("-".to_owned(), |p| format!("{:.2}", p.mean));
         SHOWN.map(at)
     };
-    for ((view, other), errors) in pairs.iter().zip(&measured) {
-        rows.push(vec![view.name.clone(), other.name.clone(), errors.pixels.to_string()]);
+    for Judged { view, held_out, errors } in &measured {
+        rows.push(vec![view.clone(), held_out.clone(), errors.pixels.to_string()]);
         rows.last_mut().context("a row")?.extend(shown(&errors.curve));
     }
     let mut mean = vec!["mean over views".to_owned(), String::new(), String::new()];
     mean.extend(shown(&curve));
     rows.push(mean);
-    let text =
-        format!("mean difference in grey levels of 255, of the most confident pixels\n{}", table(&rows));
-    Ok(Outcome { text, value, skipped_views: false })
+    let text = format!(
+        "{}mean difference in grey levels of 255, of the most confident pixels\n{}",
+        skipped.lines(),
+        table(&rows)
+    );
+    Ok(Outcome { text, value, skipped_views: !skipped.is_empty() })
+}
+
+/// A view, the one that its depth map is compared with, and what came of it.
+#[derive(Serialize)]
+struct Judged {
+    view: String,
+    held_out: String,
+    errors: PhotometricErrors,
 }
 
 fn measure(
@@ -126,9 +142,10 @@ fn read_recorded(path: &Path, recorded: &BlobKey) -> Result<Raster<[u8; 3]>> {
 }
 
 /// The mean over views of each point of their curves.
-fn mean_curve(measured: &[PhotometricErrors]) -> Vec<PhotometricPoint> {
+fn mean_curve(measured: &[Judged]) -> Vec<PhotometricPoint> {
     let at = |place: usize| {
-        let points: Vec<&PhotometricPoint> = measured.iter().filter_map(|e| e.curve.get(place)).collect();
+        let points: Vec<&PhotometricPoint> =
+            measured.iter().filter_map(|judged| judged.errors.curve.get(place)).collect();
         let count = points.len() as f64;
         let mean = |of: fn(&PhotometricPoint) -> f64| points.iter().map(|p| of(p)).sum::<f64>() / count;
         (!points.is_empty()).then(|| PhotometricPoint {
