@@ -29,20 +29,30 @@ pub struct Computation<'a> {
     pub exclusive: bool,
 }
 
+/// What came of it.
+pub struct Computed {
+    /// Of every job; all blobs are in the store.
+    pub results: Vec<JobResult>,
+    /// How many jobs an earlier run had done.
+    pub reused: u32,
+}
+
 impl Computation<'_> {
-    /// Has all jobs done and returns their results, whose blobs are all in the store; `None` when `stop`
-    /// was cancelled first. `on_work` is told each run that has something to be done.
+    /// Has all jobs done; `None` when `stop` was cancelled first. `on_work` is told each run that has something to be
+    /// done.
     pub async fn run(
         &self,
         stop: &CancellationToken,
         mut on_work: impl FnMut(&RunId) -> Result<()>,
-    ) -> Result<Option<Vec<JobResult>>> {
+    ) -> Result<Option<Computed>> {
         let mut missing: Vec<JobId> = Vec::new();
+        let mut reused_first = None;
         for _ in 0..=MAX_REPAIRS {
             let Submitted { run, jobs, reused } = self.submit(std::mem::take(&mut missing)).await?;
             if reused > 0 {
                 eprintln!("{reused} of {jobs} jobs are done already");
             }
+            let reused_first = *reused_first.get_or_insert(reused);
             let Some(mut results) = results(&self.client, &run, stop).await? else { return Ok(None) };
             missing = self.lost(&results).await?;
             if missing.is_empty() && !results.iter().all(|result| has_ended(result.state)) {
@@ -59,7 +69,7 @@ impl Computation<'_> {
                 missing = self.lost(&results).await?;
             }
             if missing.is_empty() {
-                return Ok(Some(results));
+                return Ok(Some(Computed { results, reused: reused_first }));
             }
             eprintln!("{} results in the store are lost or damaged and are made again", missing.len());
         }

@@ -71,10 +71,10 @@ pub fn render_html(report: &RunReport, pictures: &Pictures) -> Result<String, Pi
 fn push_figures(page: &mut String, report: &RunReport) {
     let views = report.views.len() as u64;
     let figures = [
-        (grouped(report.totals.points), "points"),
-        (grouped(views), "views"),
-        (grouped(report.skipped.len() as u64), "views skipped"),
-        (duration(report.totals.wall_seconds), "from start to end"),
+        (grouped(report.totals.points), "points".to_owned()),
+        (grouped(views), "views".to_owned()),
+        (grouped(report.skipped.len() as u64), "views skipped".to_owned()),
+        (duration(report.totals.wall_seconds), report.totals.span()),
     ];
     push(page, format_args!("<div class=\"figures\">\n"));
     for (figure, what) in figures {

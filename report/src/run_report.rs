@@ -131,8 +131,25 @@ pub struct SkippedView {
 pub struct Totals {
     /// Points of the cloud.
     pub points: u64,
-    /// Seconds from start to end.
+    /// Seconds from start to end, of the command that ended the run.
     pub wall_seconds: f64,
+    /// Jobs of the run.
+    #[serde(default)]
+    pub jobs: u64,
+    /// Those of them that an earlier command had done; their seconds are in no [`Totals::wall_seconds`], but in the sums
+    /// of the stages.
+    #[serde(default)]
+    pub jobs_done_before: u64,
+}
+
+impl Totals {
+    /// What [`Totals::wall_seconds`] are the seconds of, in words.
+    pub fn span(&self) -> String {
+        match self.jobs_done_before {
+            0 => "from start to end".to_owned(),
+            before => format!("of this command; {before} of {} jobs were done before", self.jobs),
+        }
+    }
 }
 
 impl RunReport {
@@ -197,7 +214,7 @@ pub(crate) mod tests {
             warnings: vec!["3 points have no track".into()],
             maps_by_way: BTreeMap::from([("in process".into(), 11), ("by shared memory".into(), 3)]),
             images_fetched: 4,
-            totals: Totals { points: 54_600, wall_seconds: 143.5 },
+            totals: Totals { points: 54_600, wall_seconds: 143.5, jobs: 9, jobs_done_before: 0 },
         }
     }
 

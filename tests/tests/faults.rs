@@ -110,6 +110,9 @@ fn a_killed_run_leaves_no_worker_and_is_resumed() {
     assert!(!Path::new(&bench.path("struck/cloud.ply")).exists());
     let again = bench.reconstruct("struck", &COURTYARD).expect_code(0);
     assert!(was_resumed(&again), "{}", again.stderr);
+    let says = |out: &str| String::from_utf8_lossy(&bench.read(&format!("{out}/report.html"))).into_owned();
+    assert!(says("struck").contains("of 25 jobs were done before"));
+    assert!(says("calm").contains("from start to end") && !says("calm").contains("were done before"));
     bench.same_cloud("calm", "struck");
 }
 

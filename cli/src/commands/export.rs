@@ -23,6 +23,7 @@ use rayon::prelude::*;
 use serde_json::json;
 use tokio::runtime::Runtime;
 
+use crate::computation::Computed;
 use crate::console::{Outcome, shortest};
 use crate::input::{Skipped, all_skipped};
 use crate::out_folder::{OutFolder, depth_range, trajectory};
@@ -42,19 +43,23 @@ pub struct Finished<'a> {
     store: &'a Store,
     runtime: &'a Runtime,
     results: &'a [JobResult],
+    /// How many of the jobs an earlier run had done.
+    reused: u32,
     by_view: ByView<'a>,
 }
 
 impl<'a> Finished<'a> {
-    /// Of the jobs' results, whose blobs are in the store.
+    /// Of what came of its jobs; their blobs are in the store.
     pub fn new(
         out: &'a Path,
         prepared: &'a Prepared,
         store: &'a Store,
         runtime: &'a Runtime,
-        results: &'a [JobResult],
+        computed: &'a Computed,
     ) -> Self {
-        Self { out, prepared, store, runtime, results, by_view: by_view(&prepared.jobs, results) }
+        let Computed { results, reused } = computed;
+        let by_view = by_view(&prepared.jobs, results);
+        Self { out, prepared, store, runtime, results, reused: *reused, by_view }
     }
 
     fn result(&self, kind: &'static str, view: Option<ViewId>) -> Option<&'a JobResult> {
@@ -127,7 +132,7 @@ fn write(run: &Finished<'_>, mut stages: Stages, begun: Instant) -> Result<Outco
     for (name, seconds) in &stages {
         text.push_str(&format!("{seconds:8.1} s  {name}\n"));
     }
-    text.push_str(&format!("{:8.1} s  in all\n", report.totals.wall_seconds));
+    text.push_str(&format!("{:8.1} s  {}\n", report.totals.wall_seconds, report.totals.span()));
     let ways: Vec<String> =
         maps_by_way(run.results).iter().map(|(way, maps)| format!("{maps} {way}")).collect();
     text.push_str(&format!("maps reached the fusion: {}\n", ways.join(", ")));
@@ -378,7 +383,12 @@ fn report(
             .map(|(way, maps)| (way.to_string(), maps))
             .collect(),
         images_fetched: images_fetched(run.results),
-        totals: Totals { points, wall_seconds: begun.elapsed().as_secs_f64() },
+        totals: Totals {
+            points,
+            wall_seconds: begun.elapsed().as_secs_f64(),
+            jobs: run.results.len() as u64,
+            jobs_done_before: u64::from(run.reused),
+        },
     }
 }
 

@@ -8,12 +8,12 @@ use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
 use planesweep_coordinator::{Config, Coordinator};
 use planesweep_mvsnet::Refinement;
-use planesweep_proto::{Client, JobResult, Role};
+use planesweep_proto::{Client, Role};
 use planesweep_store::Store;
 
 use super::export::{self, Finished};
 use crate::args::{FilterArgs, NetworkArgs, PlanArgs, ReadArgs};
-use crate::computation::Computation;
+use crate::computation::{Computation, Computed};
 use crate::console::{Outcome, counted};
 use crate::interrupts::Interrupts;
 use crate::network::{Placement, backend_factory, default_workers, processors};
@@ -105,8 +105,8 @@ pub fn run(args: &ReconstructArgs, json: bool, verbose: u8) -> Result<Outcome> {
     let (state, _lock) = open_state(&args.out, args.fresh)?;
     let runtime = tokio::runtime::Runtime::new().context("cannot start the runtime")?;
     let team = Team { roles: roles(workers, args.fusion_worker), placement, verbose };
-    let (store, results) = runtime.block_on(compute(&state, &prepared, &team, &mut stages))?;
-    export::run(&Finished::new(&args.out, &prepared, &store, &runtime, &results), stages, begun)
+    let (store, computed) = runtime.block_on(compute(&state, &prepared, &team, &mut stages))?;
+    export::run(&Finished::new(&args.out, &prepared, &store, &runtime, &computed), stages, begun)
 }
 
 /// What each worker process does.
@@ -116,13 +116,13 @@ fn roles(workers: u32, fusion_worker: bool) -> Vec<Role> {
     roles
 }
 
-/// Has all jobs done by worker processes; returns their results, whose blobs are all in the store.
+/// Has all jobs done by worker processes; returns what came of them, and the store that holds it.
 async fn compute(
     state: &Path,
     prepared: &Prepared,
     team: &Team,
     stages: &mut Stages,
-) -> Result<(Store, Vec<JobResult>)> {
+) -> Result<(Store, Computed)> {
     let store = Store::open(&format!("file://{}", state.join("store").display()))?;
     store.put(prepared.network.bytes.clone().into()).await.context("cannot store the weights")?;
     let config = Config::new(state.join("ledger.sqlite"), store.url());
@@ -143,10 +143,10 @@ async fn compute(
         }
         Ok(())
     };
-    let results = computation.run(&interrupts.drain, start_workers).await?;
+    let computed = computation.run(&interrupts.drain, start_workers).await?;
     stages.push(("compute".to_owned(), begun.elapsed().as_secs_f64()));
     if let Some(supervisor) = supervisor {
-        if results.is_some() {
+        if computed.is_some() {
             supervisor.finish(&interrupts.kill).await;
         } else {
             supervisor.stop(&interrupts.kill).await;
@@ -154,8 +154,8 @@ async fn compute(
     }
     coordinator.shutdown().await;
     interrupts.computed.cancel();
-    let results = results.context("stopped; run the same command again to go on")?;
-    Ok((store, results))
+    let computed = computed.context("stopped; run the same command again to go on")?;
+    Ok((store, computed))
 }
 
 /// The folder of ledger and store, locked for this process.

@@ -110,18 +110,18 @@ pub fn run(args: &SubmitArgs, json: bool) -> Result<Outcome> {
         return Ok(Outcome { text: format!("{}\n", submitted.run.0), value, skipped_views });
     };
     let computing = Instant::now();
-    let results = runtime.block_on(async {
+    let computed = runtime.block_on(async {
         interrupts.clone().listen("no longer waiting", None);
         let say_run = |run: &_| {
             eprintln!("run {run}");
             Ok(())
         };
-        let results = computation.run(&interrupts.drain, say_run).await?;
+        let computed = computation.run(&interrupts.drain, say_run).await?;
         interrupts.computed.cancel();
-        results.context(
+        computed.context(
             "stopped waiting; the run goes on: the same command again waits for it, `planesweep cancel` stops it",
         )
     })?;
     stages.push(("compute".to_owned(), computing.elapsed().as_secs_f64()));
-    export::run(&Finished::new(out, &prepared, &store, &runtime, &results), stages, begun)
+    export::run(&Finished::new(out, &prepared, &store, &runtime, &computed), stages, begun)
 }
