@@ -46,16 +46,17 @@ impl Computation<'_> {
         mut on_work: impl FnMut(&RunId) -> Result<()>,
     ) -> Result<Option<Computed>> {
         let mut missing: Vec<JobId> = Vec::new();
-        let mut reused_first = None;
+        let mut reused_before = None;
         for _ in 0..=MAX_REPAIRS {
             let Submitted { run, jobs, reused } = self.submit(std::mem::take(&mut missing)).await?;
             if reused > 0 {
                 eprintln!("{reused} of {jobs} jobs are done already");
             }
-            let reused_first = *reused_first.get_or_insert(reused);
             let Some(mut results) = results(&self.client, &run, stop).await? else { return Ok(None) };
             missing = self.lost(&results).await?;
             if missing.is_empty() && !results.iter().all(|result| has_ended(result.state)) {
+                // What is reused later may be this command's own, and what was lost is not reused.
+                reused_before.get_or_insert(reused);
                 on_work(&run)?;
                 let name_of = |view| self.prepared.view_name(view).map(str::to_owned);
                 let Some(status) = follow(&self.client, &run, stop, name_of).await? else { return Ok(None) };
@@ -69,7 +70,7 @@ impl Computation<'_> {
                 missing = self.lost(&results).await?;
             }
             if missing.is_empty() {
-                return Ok(Some(Computed { results, reused: reused_first }));
+                return Ok(Some(Computed { results, reused: reused_before.unwrap_or(reused) }));
             }
             eprintln!("{} results in the store are lost or damaged and are made again", missing.len());
         }
