@@ -14,8 +14,8 @@ pub struct DepthMap {
     /// Confidence in `[0, 1]`.
     pub confidence: Raster<f32>,
     /// Red, green and blue of the reference image at each pixel of the depth map, and the confidence once more, in
-    /// 255ths: a word for each pixel of what fusion asks a neighbour for beside its depth. Who changes one confidence changes the
-    /// other ([`in_255ths`]).
+    /// 255ths: a word for each pixel of what fusion asks a neighbour for beside its depth. Who changes one confidence
+    /// changes the other ([`in_255ths`]).
     pub color: Raster<[u8; 4]>,
 }
 

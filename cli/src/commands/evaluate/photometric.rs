@@ -59,11 +59,12 @@ pub fn run(args: &PhotometricArgs) -> Result<Outcome> {
     };
     let (measured, skipped) = split(pairs.par_iter().map(judge).collect());
     let curve = mean_curve(&measured);
-    if curve.is_empty() && skipped.is_empty() {
-        bail!("no view of {} overlaps with one that is no source of it", args.result.display());
-    }
     if curve.is_empty() {
-        bail!("no view of {} could be judged{}", args.result.display(), skipped.reasons());
+        bail!(
+            "no view of {} can be compared with one that is no source of it{}",
+            args.result.display(),
+            skipped.reasons()
+        );
     }
     let value = json!({
         "mean": { "views": measured.len(), "curve": curve },
