@@ -203,7 +203,7 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     unsafe fn gather(from: *const f32, at: Self::I) -> Self::F {
-        [_mm256_i32gather_ps::<4>(from, at[0]), _mm256_i32gather_ps::<4>(from, at[1])]
+        both!(_mm256_castsi256_ps; Self::gather_words(from.cast(), at))
     }
     #[inline(always)]
     unsafe fn gather_words(from: *const [u8; 4], at: Self::I) -> Self::I {

@@ -48,7 +48,7 @@ pub(super) struct Sums<L: Lanes> {
     beaten: L::M,
 }
 
-/// Sixteen hypotheses; those that are not kept mean nothing.
+/// Of sixteen hypotheses; zeros where they are not kept.
 pub(super) struct Means {
     /// Of the reference's depths.
     pub depth: [f32; LANES],
@@ -115,22 +115,22 @@ impl<L: Lanes> Sums<L> {
         }
     }
 
-    /// The means over the views that agree.
+    /// The means over the views that agree, for hypotheses that are kept.
     ///
     /// # Safety
     /// As [`Lanes`].
     #[inline(always)]
-    pub unsafe fn means(self, votes: &Votes<L>) -> Means {
+    pub unsafe fn means(self, votes: &Votes<L>, is_kept: L::M) -> Means {
         let scale = L::div(L::splat(1.0), votes.count);
         let [r, g, b, confidence] = self.color;
         let low = L::or_i(mean::<L>(r, scale), L::mul_i(mean::<L>(g, scale), L::splat_i(1 << 8)));
         let high = L::or_i(mean::<L>(b, scale), L::mul_i(mean::<L>(confidence, scale), L::splat_i(1 << 8)));
         let color = L::or_i(low, L::mul_i(high, L::splat_i(1 << 16)));
         Means {
-            depth: L::store(L::div(self.depth, votes.count)),
-            color: L::store_i(color),
-            agreeing: [L::store_i(votes.agreeing[0]), L::store_i(votes.agreeing[1])],
-            owns: !L::bits(self.beaten),
+            depth: L::store(L::only(is_kept, L::div(self.depth, votes.count))),
+            color: L::store_i(L::only_i(is_kept, color)),
+            agreeing: votes.agreeing.map(|views| L::store_i(L::only_i(is_kept, views))),
+            owns: L::bits(L::but_not(is_kept, self.beaten)),
         }
     }
 }

@@ -140,7 +140,8 @@ unsafe fn blocks<L: Lanes>(row: Row<'_, '_>) -> usize {
             write_views(block, &L::store_i(L::min_i(L::truncate(votes.count), L::splat_i(255))), out.views);
             // Without any view there is no mean. Beyond the end of a block nothing agrees.
             let least = options.min_views.max(1) as f32;
-            let kept_here = L::bits(L::less(L::splat(least - 0.5), votes.count));
+            let is_kept = L::less(L::splat(least - 0.5), votes.count);
+            let kept_here = L::bits(is_kept);
             if kept_here != 0 {
                 let mut sums = Sums::<L>::of_reference(input, y, block);
                 for (neighbour, (place, answer)) in neighbours.iter().zip(places.iter().zip(&*answers)) {
@@ -150,7 +151,7 @@ unsafe fn blocks<L: Lanes>(row: Row<'_, '_>) -> usize {
                         sums = sums.and(neighbour, min_confidence, d, (place, answer));
                     }
                 }
-                write_means(block, kept_here, &sums.means(&votes), out);
+                write_means(block, &sums.means(&votes, is_kept), out);
             }
             kept_here.count_ones() as usize
         };
@@ -216,15 +217,16 @@ fn write_views(block: &Block<'_>, count: &[i32; LANES], views: &mut [u8]) {
     }
 }
 
-/// Writes the hypotheses of a block that are kept.
+/// Writes what the hypotheses of a block come to; the means of those that are not kept are zeros.
 #[inline(always)]
-fn write_means(block: &Block<'_>, kept: u32, means: &Means, out: &mut OutputRow<'_>) {
-    for k in (0..LANES).filter(|k| kept >> k & 1 == 1) {
+fn write_means(block: &Block<'_>, means: &Means, out: &mut OutputRow<'_>) {
+    // The limit spares a check of each index.
+    for k in 0..block.count.min(LANES) {
         let x = block.columns[k] as usize;
         out.depth[x] = means.depth[k];
         out.color[x] = means.color[k].to_le_bytes();
-        let [low, high] = means.agreeing.map(|bits| u64::from(bits[k] as u32));
-        out.agreeing[x] = low | high << 32;
+        let [low, high] = [means.agreeing[0][k], means.agreeing[1][k]];
+        out.agreeing[x] = u64::from(low as u32) | u64::from(high as u32) << 32;
         out.owns[x] = means.owns >> k & 1 == 1;
     }
 }

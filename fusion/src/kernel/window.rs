@@ -28,9 +28,7 @@ impl Window {
         if !L::PICKS || place.inside == 0 || place.border != 0 || columns < WINDOW_COLUMNS {
             return None;
         }
-        // The remainders spare a check of the index.
-        let first = place.inside.trailing_zeros() as usize % LANES;
-        let last = place.inside.ilog2() as usize % LANES;
+        let [first, last] = ends(place.inside);
         // In the middle between the first place and the last, and within the map.
         let spare = WINDOW_COLUMNS - 2;
         let column = (place.column[first] + place.column[last] - spare) >> 1;
@@ -50,17 +48,18 @@ impl Window {
         let next = L::add_i(at, L::splat_i(1));
         let rows = L::load_i(&place.row);
         let mut corners = [L::splat(0.0); 4];
-        // Mostly all places lie in one row or two.
         let mut left = place.inside;
         while left != 0 {
-            let row = place.row[left.trailing_zeros() as usize % LANES];
-            let is_there = L::equal(rows, L::splat_i(row));
-            left &= !L::bits(is_there);
-            let upper = neighbour.depth.as_ptr().add(self.offset(neighbour, row));
-            let lower = upper.add(neighbour.size[0] as usize);
-            let depths = [L::pick(upper, at), L::pick(upper, next), L::pick(lower, at), L::pick(lower, next)];
-            for (corner, depth) in corners.iter_mut().zip(depths) {
-                *corner = L::select(is_there, depth, *corner);
+            for row in ends(left).map(|lane| place.row[lane]) {
+                let is_there = L::equal(rows, L::splat_i(row));
+                left &= !L::bits(is_there);
+                let upper = neighbour.depth.as_ptr().add(self.offset(neighbour, row));
+                let lower = upper.add(neighbour.size[0] as usize);
+                let depths =
+                    [L::pick(upper, at), L::pick(upper, next), L::pick(lower, at), L::pick(lower, next)];
+                for (corner, depth) in corners.iter_mut().zip(depths) {
+                    *corner = L::select(is_there, depth, *corner);
+                }
             }
         }
         corners
@@ -78,11 +77,12 @@ impl Window {
         let mut colors = L::splat_i(0);
         let mut left = L::bits(agrees);
         while left != 0 {
-            let row = answer.row[left.trailing_zeros() as usize % LANES];
-            let is_there = L::equal(rows, L::splat_i(row));
-            left &= !L::bits(is_there);
-            let first = neighbour.color.as_ptr().add(self.offset(neighbour, row));
-            colors = L::select_i(is_there, L::pick_words(first, at), colors);
+            for row in ends(left).map(|lane| answer.row[lane]) {
+                let is_there = L::equal(rows, L::splat_i(row));
+                left &= !L::bits(is_there);
+                let first = neighbour.color.as_ptr().add(self.offset(neighbour, row));
+                colors = L::select_i(is_there, L::pick_words(first, at), colors);
+            }
         }
         colors
     }
@@ -92,4 +92,14 @@ impl Window {
     fn offset(self, neighbour: &Neighbour<'_>, row: i32) -> usize {
         row as usize * neighbour.size[0] as usize + self.column as usize
     }
+}
+
+/// The first lane and the last of those whose bits are set; some are.
+///
+/// Mostly all places lie in one row or two, so in those of the ends: taking both each time spares the processor a guess
+/// at how many there are.
+#[inline(always)]
+fn ends(lanes: u32) -> [usize; 2] {
+    // The remainders spare a check of the index.
+    [lanes.trailing_zeros() as usize % LANES, lanes.ilog2() as usize % LANES]
 }
