@@ -23,8 +23,8 @@ use planesweep_fusion::{
 use planesweep_scene::{Camera, DepthMap, Intrinsics, Pose, Raster};
 
 const NEIGHBOURS: usize = 10;
-/// How long ours is timed in a turn.
-const AT_LEAST_MS: f64 = 20.0;
+/// About how long ours is timed in a turn.
+const TURN_MS: f64 = 20.0;
 /// Longer than the threads of numpy and OpenCV wait in loops.
 const IDLE: Duration = Duration::from_millis(200);
 const METHODS: [FusionMethod; 4] = [
@@ -101,8 +101,8 @@ fn fuse(maps: &[DepthMap], method: FusionMethod) -> FilteredMap {
     filter(&maps[0], &neighbours, &FilterOptions { method, ..FilterOptions::default() })
 }
 
-/// Time of a run. Its result is kept for the next run to drop, as workers keep what others will ask for: the memory of
-/// the one before is used again.
+/// Time of a run, and of dropping the result of the one before, which is kept until then as workers keep what others will
+/// ask for.
 fn milliseconds<T>(kept: &mut Option<T>, run: impl Fn() -> T) -> f64 {
     let begun = Instant::now();
     *kept = Some(black_box(run()));
@@ -137,10 +137,10 @@ fn against_twin(maps: &[DepthMap], python: &str, runs: usize) {
     for _ in 0..runs {
         // Numpy's threads wait in loops for more to do, and would take a processor from us.
         sleep(IDLE);
-        // The first run warms the caches that the other program emptied; then as many as take about as long as one of
-        // numpy's, whose threads are awake for most of its run, too.
+        // The first run warms the caches that the other program emptied, as numpy's first does; then enough of them that
+        // the second thread is awake for most of the time, as numpy's are.
         let first = milliseconds(&mut kept, || fuse(maps, FusionMethod::Consistency));
-        let views = (AT_LEAST_MS / first).ceil().max(1.0);
+        let views = (TURN_MS / first).ceil().max(1.0);
         let before = cpu_milliseconds();
         let all =
             (0..views as usize).map(|_| milliseconds(&mut kept, || fuse(maps, FusionMethod::Consistency)));

@@ -13,19 +13,19 @@ use crate::surface::Rival;
 
 /// Stands for a projection behind the camera: far enough outside every image to read nothing.
 const OUTSIDE: f32 = -2.0;
-/// Sides from which on `f32` does not tell columns apart; larger maps are not read.
+/// Sides from which on `f32` does not tell columns apart; no hypothesis is put to larger maps.
 const MAX_SIDE: usize = 1 << 24;
-/// Pixels from which on an index of 32 bits does not do for all arithmetic with them; larger maps are not read.
+/// Pixels from which on an index of 32 bits does not do for all arithmetic with them; as above.
 const MAX_PIXELS: usize = 1 << 29;
 
 /// A neighbour as the criterion needs it.
 pub(crate) struct Neighbour<'a> {
     /// Its depth map.
     pub map: &'a DepthMap,
-    /// The map's rasters, all of its size; colours are empty where it is too large to be read.
+    /// The map's rasters, all of its size.
     pub depth: &'a [f32],
     pub color: &'a [[u8; 4]],
-    /// Columns and rows; 0 where the map is too large to be read.
+    /// Columns and rows; 0 where the map is too large for hypotheses to be put to it.
     pub size: [i32; 2],
     /// Columns and rows of pixels that have others to the right and below: of the squares between four pixels.
     pub squares: [i32; 2],
@@ -43,7 +43,8 @@ impl<'a> Neighbour<'a> {
     /// Prepares `map` to be asked about pixels of `reference`.
     ///
     /// # Panics
-    /// When the map's rasters differ in size: they are read without a check of each index.
+    /// When the map's rasters differ in size, for they are read without a check of each index, or it has 2^29 columns or
+    /// more.
     pub fn new(reference: &Camera, map: &'a DepthMap) -> Self {
         let there = Transfer::between(reference, &map.camera);
         let (width, height) = (map.width(), map.height());
@@ -53,7 +54,7 @@ impl<'a> Neighbour<'a> {
         Self {
             map,
             depth: map.depth.values(),
-            color: if extent == [0; 2] { &[] } else { map.color.values() },
+            color: map.color.values(),
             size: extent,
             squares: extent.map(|side| (side - 1).max(0)),
             touching_squares: extent.map(|side| if side > 0 { side + 1 } else { 0 }),
@@ -77,7 +78,7 @@ impl<'a> Neighbour<'a> {
     }
 }
 
-/// Columns and rows of a map; 0 where it is too large to be read.
+/// Columns and rows of a map; 0 where it is too large for an index of it.
 pub(crate) fn readable_size([width, height]: [usize; 2]) -> [i32; 2] {
     let is_small = width < MAX_SIDE && height < MAX_SIDE && width * height < MAX_PIXELS;
     if is_small { [width as i32, height as i32] } else { [0; 2] }

@@ -2,8 +2,8 @@
 
 use crate::kernel::{COUNTING, LANES, Lanes};
 
-/// Depths of neighbouring pixels that differ by less, relatively, are taken for one surface; of sixteen columns at once,
-/// those that differ so from the last before.
+/// Depths that differ by less, relatively, from the surface seen last are taken for it; sixteen columns at once are
+/// compared with the last depth of the surface before them.
 const ONE_SURFACE: f32 = 0.02;
 /// After as many in a row that lie apart from the surface before, the next one makes a surface; of sixteen columns at
 /// once, when most of them do.

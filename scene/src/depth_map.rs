@@ -1,8 +1,14 @@
 //! A depth map with its confidence, its colours and its own camera.
 
+use std::ops::RangeInclusive;
+
 use thiserror::Error;
 
 use crate::{Camera, Raster};
+
+/// What counts as a depth. Beyond, squares and sums of depths would not be floats; some programs write the greatest float
+/// where they have no depth.
+const DEPTHS: RangeInclusive<f32> = 1e-15..=1e15;
 
 /// Depth, confidence and colour of one view, all of one size, with the camera they belong to.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,8 +45,8 @@ pub enum DepthMapError {
 }
 
 impl DepthMap {
-    /// Puts the parts together; values that are not finite or not positive become invalid (0), and
-    /// confidence is clamped to `[0, 1]`.
+    /// Puts the parts together; depths that are not between 1e-15 and 1e15 become invalid (0), and confidence is clamped
+    /// to `[0, 1]`.
     pub fn new(
         camera: Camera,
         mut depth: Raster<f32>,
@@ -57,11 +63,7 @@ impl DepthMap {
                 return Err(DepthMapError::SizeMismatch { part, got_width, got_height, width, height });
             }
         }
-        for d in depth.values_mut() {
-            if !(d.is_finite() && *d > 0.0) {
-                *d = 0.0;
-            }
-        }
+        clear_what_is_no_depth(&mut depth);
         for c in confidence.values_mut() {
             *c = if c.is_nan() { 0.0 } else { c.clamp(0.0, 1.0) };
         }
@@ -101,6 +103,15 @@ impl DepthMap {
     }
 }
 
+/// Makes 0, "no depth", of what is not within [`DEPTHS`].
+pub(crate) fn clear_what_is_no_depth(depth: &mut Raster<f32>) {
+    for d in depth.values_mut() {
+        if !DEPTHS.contains(d) {
+            *d = 0.0;
+        }
+    }
+}
+
 /// Colours, and beside each the confidence in 255ths.
 ///
 /// # Panics
@@ -135,7 +146,7 @@ mod tests {
 
     #[test]
     fn what_is_no_depth_becomes_zero() {
-        let depth = Raster::new(2, 2, vec![f32::NAN, -1.0, f32::INFINITY, 2.0]).expect("2x2");
+        let depth = Raster::new(2, 2, vec![f32::NAN, -1.0, f32::MAX, 2.0]).expect("2x2");
         let confidence = Raster::new(2, 2, vec![f32::NAN, -1.0, 3.0, 0.5]).expect("2x2");
         let map =
             DepthMap::new(camera(), depth, confidence, Raster::filled(2, 2, [0; 3])).expect("sizes agree");

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 use crate::Raster;
+use crate::depth_map::clear_what_is_no_depth;
 use crate::write::write_atomically;
 
 /// Why a PFM could not be read or written.
@@ -129,14 +130,10 @@ pub fn read_pfm(path: &Path) -> Result<Raster<f32>, PfmError> {
     decode_pfm(&bytes).map_err(|source| PfmError::Decode { path: path.to_owned(), source })
 }
 
-/// Reads a depth map: what is not finite or not positive becomes 0, which is "no depth".
+/// Reads a depth map: what is not between 1e-15 and 1e15 becomes 0, which is "no depth".
 pub fn read_depth_pfm(path: &Path) -> Result<Raster<f32>, PfmError> {
     let mut depth = read_pfm(path)?;
-    for d in depth.values_mut() {
-        if !(d.is_finite() && *d > 0.0) {
-            *d = 0.0;
-        }
-    }
+    clear_what_is_no_depth(&mut depth);
     Ok(depth)
 }
 
@@ -209,7 +206,7 @@ mod tests {
     fn nan_infinite_and_negative_depths_are_invalid() {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let path = folder.path().join("depth.pfm");
-        let raster = Raster::new(5, 1, vec![1.5, f32::NAN, f32::INFINITY, -2.0, 0.0]).expect("5x1");
+        let raster = Raster::new(5, 1, vec![1.5, f32::NAN, f32::INFINITY, -2.0, f32::MAX]).expect("5x1");
         write_pfm(&path, &raster).expect("written");
         assert_eq!(read_depth_pfm(&path).expect("read").values(), [1.5, 0.0, 0.0, 0.0, 0.0]);
         assert_eq!(read_pfm(&path).expect("read").at(3, 0), -2.0);

@@ -36,8 +36,11 @@ impl<T> Raster<T> {
     }
 
     /// Computes each value from its column and row.
+    ///
+    /// # Panics
+    /// When no memory has so many addresses.
     pub fn from_fn(width: usize, height: usize, mut value: impl FnMut(usize, usize) -> T) -> Self {
-        let mut values = Vec::with_capacity(width * height);
+        let mut values = Vec::with_capacity(pixels(width, height));
         for y in 0..height {
             for x in 0..width {
                 values.push(value(x, y));
@@ -87,8 +90,11 @@ impl<T> Raster<T> {
 
 impl<T: Copy> Raster<T> {
     /// A raster of one value.
+    ///
+    /// # Panics
+    /// As [`Raster::from_fn`].
     pub fn filled(width: usize, height: usize, value: T) -> Self {
-        Self { width, height, values: vec![value; width * height] }
+        Self { width, height, values: vec![value; pixels(width, height)] }
     }
 
     /// The value at a column and row.
@@ -116,6 +122,11 @@ impl<T: Copy> Raster<T> {
     }
 }
 
+/// How many values a raster has: kernels rely on it, so the product must not wrap.
+fn pixels(width: usize, height: usize) -> usize {
+    width.checked_mul(height).expect("memory has an address for each pixel")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -126,6 +137,12 @@ mod tests {
         assert_eq!(error, RasterError::WrongLength { width: 3, height: 2, got: 5 });
         assert_eq!(error.to_string(), "a raster of 3x2 needs 6 values, got 5");
         assert!(Raster::<u8>::new(usize::MAX, 2, vec![]).is_err());
+    }
+
+    #[test]
+    #[should_panic(expected = "memory has an address for each pixel")]
+    fn more_pixels_than_addresses_are_refused() {
+        Raster::filled(usize::MAX / 2 + 2, 2, ());
     }
 
     #[test]

@@ -56,7 +56,7 @@ pub struct FilteredMap {
 /// Rows are computed in parallel; the result has the same bits for any number of threads.
 ///
 /// # Panics
-/// When the rasters of a map differ in size, which [`DepthMap::new`] refuses, or it has 2^29 columns.
+/// When the rasters of a map differ in size, which [`DepthMap::new`] refuses, or it has 2^29 columns or more.
 pub fn filter(reference: &DepthMap, neighbours: &[&DepthMap], options: &FilterOptions) -> FilteredMap {
     filter_with(Level::detect(), reference, neighbours, options)
 }

@@ -391,6 +391,22 @@ fn wider_registers_change_no_bit() {
 }
 
 #[test]
+fn of_hundreds_of_neighbours_all_are_averaged_and_the_first_are_named() {
+    let reference = PLANE.map(camera_at(0.3, 0.2, 40, 30));
+    let mut blind = reference.clone();
+    blind.depth = Raster::filled(40, 30, 0.0);
+    let sees = |k: u32| k % 3 != 1;
+    let neighbours: Vec<_> = (0..450).map(|k| if sees(k) { &reference } else { &blind }).collect();
+    let named = (0..64).filter(|k| sees(*k)).map(|k| 1 << k).sum();
+    for level in Level::available() {
+        let filtered = filter_with(level, &reference, &neighbours, &FilterOptions::default());
+        assert_eq!(filtered.views, Raster::filled(40, 30, 255), "{level:?}");
+        assert_eq!(filtered.agreeing, Raster::filled(40, 30, named), "{level:?}");
+        assert_eq!(filtered.color, reference.color, "{level:?}");
+    }
+}
+
+#[test]
 fn maps_about_as_large_as_a_window_change_no_bit() {
     let noise: Vec<_> = (0..991).map(|i| ((i as f32 * 0.3).sin(), 0.75 + (i as f32).sin() / 4.0)).collect();
     let map = |x, (width, height)| noisy_map(camera_at(x, 0.1, width, height), &noise);

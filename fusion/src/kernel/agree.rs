@@ -43,7 +43,7 @@ pub(crate) struct Answer {
     pub depth: [f32; LANES],
     /// With [`FusionMethod::Dynamic`], the least n whose thresholds it meets.
     pub level: [f32; LANES],
-    /// The neighbour's nearest pixel; where it disagrees, any.
+    /// The neighbour's nearest pixel; where it disagrees, that or the first. What lies there is read all the same.
     pub column: [i32; LANES],
     pub row: [i32; LANES],
 }
@@ -173,7 +173,7 @@ pub(super) unsafe fn compare<L: Lanes>(
         L::and(in_front, L::and(near, alike))
     };
     answer.depth = L::store(L::only(agrees, depth));
-    // The nearest pixel; of lanes that disagree nothing will be asked.
+    // The nearest pixel; lanes that disagree are read, too, and so must be of the map.
     let column = L::add_i(L::load_i(&place.column), L::only_i(L::less(half, fx), one));
     let row = L::add_i(L::load_i(&place.row), L::only_i(L::less(half, fy), one));
     let (column, row) = if place.border == 0 {
@@ -187,7 +187,7 @@ pub(super) unsafe fn compare<L: Lanes>(
     answer.row = L::store_i(L::only_i(agrees, row));
 }
 
-// Closures are not compiled for the instructions of the function around them; these are.
+// Closures need not be compiled for the instructions of the function around them; these are.
 
 /// A coordinate of the homogeneous pixel in the neighbour.
 #[inline(always)]

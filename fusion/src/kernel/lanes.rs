@@ -16,7 +16,8 @@ pub(crate) const COUNTING: [i32; LANES] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11,
 ///
 /// # Safety
 /// Of every method: the processor has the implementor's instructions. Methods are inlined into functions that enable
-/// them. Of those that read through a pointer: what they say that they read can be read; indices are not negative.
+/// them. Of those that read through a pointer: what they say that they read can be read, and indices are not negative, but
+/// those of picks may be.
 pub(crate) trait Lanes {
     /// Floats.
     type F: Copy;
@@ -113,7 +114,7 @@ pub(crate) trait Lanes {
         }
     }
 
-    /// Whether [`Lanes::pick`] and [`Lanes::pick_words`] are faster than a copy for each lane.
+    /// Whether [`Lanes::pick`] and [`Lanes::pick_words`] are faster than a copy for each lane; else only tests use them.
     const PICKS: bool = false;
     /// Values of the [`WINDOW_COLUMNS`] that can be read from `window` on: in each lane the one at `at`, modulo their
     /// number.

@@ -82,7 +82,7 @@ impl<L: Lanes> Sums<L> {
 
     /// With what a neighbour has at `place` for hypotheses of depth `d`, where it agrees.
     ///
-    /// A view with a smaller footprint owns the surface, if it is confident, to half a 255th: it will not emit it otherwise.
+    /// A view with a smaller footprint owns the surface, if it is confident, to a 255th: it will not emit it otherwise.
     ///
     /// # Safety
     /// As [`Lanes`]; `answer` is this neighbour's, to what is at `place`, and it agrees with something.
@@ -129,7 +129,10 @@ impl<L: Lanes> Sums<L> {
         Means {
             depth: L::store(L::only(is_kept, L::div(self.depth, votes.count))),
             color: L::store_i(L::only_i(is_kept, color)),
-            agreeing: votes.agreeing.map(|views| L::store_i(L::only_i(is_kept, views))),
+            agreeing: [
+                L::store_i(L::only_i(is_kept, votes.agreeing[0])),
+                L::store_i(L::only_i(is_kept, votes.agreeing[1])),
+            ],
             owns: L::bits(L::but_not(is_kept, self.beaten)),
         }
     }

@@ -46,7 +46,7 @@ fn corners_with_border(neighbour: &Neighbour<'_>, place: &Place) -> [[f32; LANES
 /// As [`Lanes`]; `answer` is this neighbour's, and it agrees with something: so its map has a pixel.
 #[inline(always)]
 pub(super) unsafe fn colors<L: Lanes>(neighbour: &Neighbour<'_>, answer: &Answer) -> L::I {
-    // SAFETY: the pixels are of the map, the first one in lanes that disagree; its rasters have one size.
+    // SAFETY: the pixels are of the map, whether their lanes agree or not; its rasters have one size.
     L::gather_words(neighbour.color.as_ptr(), indices::<L>(neighbour, &answer.column, &answer.row))
 }
 

@@ -87,7 +87,7 @@ impl Window {
         colors
     }
 
-    /// Index of the first pixel of a row.
+    /// Index of the window's first pixel in a row.
     #[inline(always)]
     fn offset(self, neighbour: &Neighbour<'_>, row: i32) -> usize {
         row as usize * neighbour.size[0] as usize + self.column as usize

@@ -66,15 +66,12 @@ impl Kernel for Rendering<'_, '_> {
                     continue;
                 }
                 let (u, v, z) = transfer.project(x as f32, depth);
-                if !(u > -0.5
-                    && v > -0.5
-                    && u < width as f32 - 0.5
-                    && v < height as f32 - 0.5
-                    && z.is_finite())
-                {
+                // The sum may round up to the next pixel: it is what must lie within.
+                let (column, line) = ((u + 0.5) as usize, (v + 0.5) as usize);
+                if !(u > -0.5 && v > -0.5 && column < width && line < height && z.is_finite()) {
                     continue;
                 }
-                let index = (v + 0.5) as usize * width + (u + 0.5) as usize;
+                let index = line * width + column;
                 let nearest = &mut depths.values_mut()[index];
                 if *nearest == 0.0 || z < *nearest {
                     *nearest = z;
@@ -87,8 +84,26 @@ impl Kernel for Rendering<'_, '_> {
 
 #[cfg(test)]
 mod tests {
+    use planesweep_scene::Intrinsics;
+
     use super::*;
     use crate::analytic::{Surface, camera_at, set_confidence};
+
+    #[test]
+    fn what_rounds_up_to_a_pixel_behind_the_last_is_not_seen() {
+        let map = |cx: f64| {
+            let mut map = Surface::Plane { slope: 0.0 }.map(camera_at(0.0, 0.0, 1, 2));
+            map.depth = Raster::filled(1, 2, 1.0);
+            map.camera.intrinsics =
+                Intrinsics { width: 1, height: 2, fx: 1.0, fy: 1.0, skew: 0.0, cx, cy: 0.0 };
+            map
+        };
+        // With this, u + 0.5 is 1 as a float, though u is less than 0.5.
+        let below_half = 0.499_999_97;
+        let rendered =
+            render(Level::detect(), &Neighbour::new(&map(below_half).camera, &map(0.0)), 1, 2, 0.8);
+        assert!(rendered.at(0, 0).is_none() && rendered.at(0, 1).is_none());
+    }
 
     #[test]
     fn the_nearest_surface_is_seen_where_it_lies() {
